@@ -24,7 +24,7 @@ from sros_tool.owners import (
     steps_to,
     user_name,
 )
-from sros_tool.wording import first_few
+from sros_tool.wording import capitalized, first_few
 
 if TYPE_CHECKING:
     from datetime import datetime, tzinfo
@@ -331,7 +331,7 @@ def _check_pin(token_uri: TokenUri, enclave: str, how_to_accept: str) -> None:
     if problem := pin_file_problem(token_uri):
         raise KeystoreError(
             f"the PIN for the key of enclave {enclave} is missing or not protected",
-            f"{problem[:1].upper()}{problem[1:]}.",
+            f"{capitalized(problem)}.",
             how_to_accept.lstrip(),
         )
 

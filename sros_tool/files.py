@@ -22,6 +22,7 @@ from sros_tool.folders import (
     write_all,
 )
 from sros_tool.terminal import log_step
+from sros_tool.wording import capitalized
 
 _MOST_LINKS = 40
 
@@ -325,7 +326,7 @@ def read_toml(data: bytes, name: str, remedy: str = "", *, longest: int = _LONGE
 def toml_error(error: ValueError, name: str, remedy: str = "") -> DocumentError:
     """Return the error for a file, named ``name``, that the parser of TOML refused."""
     why = str(error)
-    return DocumentError(f"{name} is not valid TOML", f"{why[:1].upper()}{why[1:]}.", remedy)
+    return DocumentError(f"{name} is not valid TOML", f"{capitalized(why)}.", remedy)
 
 
 def parse_toml(text: str, longest: int = _LONGEST_DOCUMENT) -> dict[str, Any]:

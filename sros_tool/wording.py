@@ -28,6 +28,11 @@ def first_few(
     return separator.join(texts[:maximum]) + (f"{joint}{number}" if left_out > 0 else "")
 
 
+def capitalized(text: str) -> str:
+    """Return a text that begins with a capital, as the start of a sentence."""
+    return text[:1].upper() + text[1:]
+
+
 def natural_sort_key(name: str) -> list[tuple[int, str]]:
     """Return the key that sorts r2 before r10."""
     return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _NUMBER.split(name)]

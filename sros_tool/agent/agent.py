@@ -125,7 +125,7 @@ from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import Secrets, open_enclave_key, place_in_file
 from sros_tool.runtime.processes import RunningProcesses, boot_id
 from sros_tool.validity import elapsed, iso, time_of_file
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import capitalized, counted, first_few
 from sros_tool.xml import read_bytes
 
 _CLOCK_TOLERANCE = timedelta(minutes=2)
@@ -1164,7 +1164,7 @@ def _enclave_expiry(enclave: InstalledEnclave | None) -> EnclaveExpiry:
 
 def _error_sentence(error: SrosError) -> str:
     text = str(error)
-    begun = text if text.startswith("http") else text[:1].upper() + text[1:]
+    begun = text if text.startswith("http") else capitalized(text)
     return begun + ("" if text.endswith(".") else ".")
 
 
@@ -1213,7 +1213,7 @@ def send(
         why = error_clause(error)
         raise kind(
             failure,
-            f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
+            f"{capitalized(why).removesuffix('.')}.",
             "The agent tries again in its next round.",
         ) from error
     if not 200 <= reply.status < 300:

@@ -31,6 +31,7 @@ from sros_tool.keystore.delivery.release import (
     release_target,
 )
 from sros_tool.validity import iso
+from sros_tool.wording import capitalized
 from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
@@ -358,7 +359,7 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         cause = error.__cause__
         if isinstance(cause, ssl.SSLCertVerificationError) and cause.verify_code in _DATE_ERRORS:
             why = f"{why} The clock here shows {iso(now)}."
-            remedy = f"{_SET_CLOCK[:1].upper()}{_SET_CLOCK[1:]}. If it is correct, renew the "
+            remedy = f"{capitalized(_SET_CLOCK)}. If it is correct, renew the "
             remedy += "certificate of the server."
             return FetchError(FetchProblem.UNREACHABLE, what, why, remedy)
         return FetchError(FetchProblem.UNREACHABLE, what, why)
@@ -388,4 +389,4 @@ def _error_sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     text = text.strip().removesuffix(".") or type(error).__name__
-    return f"{text[:1].upper()}{text[1:]}."
+    return f"{capitalized(text)}."

@@ -71,7 +71,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import last_update, newest_list, next_update, read_lists
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_enclave_key
 from sros_tool.validity import iso
-from sros_tool.wording import enumerated
+from sros_tool.wording import capitalized, enumerated
 
 _OPTIONAL_RELEASE_FILES = (*OPTIONAL_FILES, *ZENOH_FILES)
 _ENCLAVE_FILES = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
@@ -242,7 +242,7 @@ def _check_release(
     if problem := seal_problem(release, trusted):
         raise KeystoreError(
             f"release {release.number} {OF_OTHER_CA}",
-            f"{problem[:1].upper()}{problem[1:].rstrip('.')}. Nothing was changed.",
+            f"{capitalized(problem).rstrip('.')}. Nothing was changed.",
             "If this robot missed a stage of a CA rotation, bring its files: `sros distribute_key "
             f"KEYSTORE --robot {robot} FOLDER --force`. If not, check whether the server has an "
             "old "
@@ -368,7 +368,7 @@ def _enclave_change(
     takes_new = new_key is not None and new_key.public_key() == certified.public_key()
     key = new_key.public_key() if new_key and takes_new else _present_key(folder, name, files)
     state, problems = evaluate_delivered_files(name, files, key, now=now)
-    problems += _weakness_clauses(state)
+    problems += [f"{file}: {text}" for file, text in weaknesses(state)]
     if problems:
         raise KeystoreError("its new files cannot be used", "; ".join(problems))
     _check_not_older(folder, place, state, now)
@@ -437,10 +437,6 @@ def _grant_start(state: OpenedEnclave) -> datetime | None:
     with suppress(SrosError):
         return state.grant.validity.not_before if state.grant else None
     return None
-
-
-def _weakness_clauses(state: OpenedEnclave) -> list[str]:
-    return [f"{file}: {text}" for file, text in weaknesses(state)]
 
 
 def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> PublicKey:

@@ -26,6 +26,7 @@ from sros_tool.owners import (
     replaceable_on_the_way,
     user_name,
 )
+from sros_tool.wording import capitalized
 from sros_tool.xml import read_bytes
 
 SETTINGS_FILE = "agent.toml"
@@ -98,7 +99,7 @@ def check_owner(folder: Path) -> None:
         if why:
             raise KeystoreError(
                 f"others can change '{path}'",
-                f"{why[:1].upper()}{why[1:]}. Such users could choose whom the agent trusts, and "
+                f"{capitalized(why)}. Such users could choose whom the agent trusts, and "
                 "which commands it runs.",
                 f"Run `{closing_command(path, trusted)}`, or set up the agent in a folder that "
                 "only this user and root can change.",

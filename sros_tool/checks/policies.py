@@ -78,7 +78,7 @@ from sros_tool.policy.rights import Right, Rules, parts, placed_rights, policy_r
 from sros_tool.spelling import NearNames, is_typing_error
 from sros_tool.translate import contradictions, permissions_for
 from sros_tool.validity import Window
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import capitalized, counted, first_few
 from sros_tool.xml import parse, read_bytes
 
 
@@ -856,7 +856,7 @@ def _missing_common_part_cause(lacking: Sequence[_NodeLackingRight]) -> Cause:
         remedy = f"{copy}{put}`sed -E -i {edit} {quote(str(file))}`"
     else:
         remedy = f"{copy}put this line into {place} ({at}): {_INCLUDE_ELEMENT}"
-    remedy = f"{remedy[0].upper()}{remedy[1:]}"
+    remedy = capitalized(remedy)
     if any(_is_any_node(node) for node in nodes):
         remedy = f"{_NAME_NODE_FIRST_REMEDY} {remedy}"
     return Cause(

@@ -643,7 +643,7 @@ class _Runner:
             libraries = frozenset[MappedLibrary]().union(
                 *(process.dds() for process in processes.values())
             )
-            if _uses_shared_memory(row):
+            if any(claim.wire is Wire.MEMORY for claim in row.claims):
                 texts = {name: process.text for name, process in processes.items()}
                 segments = frozenset().union(
                     *(process.segments() for process in processes.values())
@@ -821,10 +821,6 @@ def groups_of_rows(rows: Sequence[Row]) -> list[list[int]]:
     for index, row in enumerate(rows):
         groups.setdefault(row.world or index, []).append(index)
     return list(groups.values())
-
-
-def _uses_shared_memory(row: Row) -> bool:
-    return any(claim.wire is Wire.MEMORY for claim in row.claims)
 
 
 def _is_needed(party: Party, row: Row) -> bool:

@@ -80,7 +80,7 @@ from sros_tool.runtime.zenoh_log import ZENOH_IDS
 from sros_tool.spelling import is_spelled_alike, is_typing_error
 from sros_tool.translate import grant_rights
 from sros_tool.values import shows
-from sros_tool.wording import enumerated, first_few, perhaps_meant
+from sros_tool.wording import capitalized, enumerated, first_few, perhaps_meant
 
 _CHANGING_NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 
@@ -550,7 +550,7 @@ class Examiner:
         only = "but a process runs in only one enclave"
         fact = f"the log shows that the process also runs {enumerated(logged)}, {only}"
         several = f"If these are several processes, {_within_sentence(advice)}"
-        return [cause, fact], f"{composed[0].upper()}{composed[1:]} {several}"
+        return [cause, fact], f"{capitalized(composed)} {several}"
 
     def _similar_name_cause(
         self, denial: Denial, name: str, enclave: LoadedEnclave, remedy: str
@@ -565,7 +565,7 @@ class Examiner:
         if other := meaning_of_other_kind(denied, named_rights(asked)):
             return [f"{other}, but {name} is {with_article(question.type)}"], ""
         if part := lacking_part(denied, named_rights(asked)):
-            advice = f"{part.advice[0].upper()}{part.advice[1:]}"
+            advice = capitalized(part.advice)
             return [part.reason], f"{advice}. {_otherwise(remedy)}"
         if rules := self._missing_rules(enclave.name, name, _served_names(asked)):
             return [f"the process had {enumerated(rules)} in its command when sros watched it"], (
@@ -926,7 +926,7 @@ def _parameter_client_hint(denial: Denial, name: str) -> str:
         return ""
     others = enumerated([other for other in PARAMETER_SERVICES if other != service])
     text = PARAMETER_CLIENT_TEXT.format(f"{others} of {node}")
-    return f" {text[0].upper()}{text[1:]}."
+    return f" {capitalized(text)}."
 
 
 def _last_part(name: str) -> str:

@@ -38,7 +38,7 @@ from sros_tool.fleet.robots import (
 )
 from sros_tool.names import distribution_problem, namespace_problem
 from sros_tool.values import parse_json
-from sros_tool.wording import shortened
+from sros_tool.wording import capitalized, shortened
 from sros_tool.xml import read_bytes
 
 MAX_BYTES = 4 * 1024 * 1024
@@ -381,7 +381,7 @@ def _load_inventory(data: bytes, label: str, *, is_json: bool) -> Mapping[str, A
             value = parse_json(data)
         except ValueError as error:
             why = str(error)
-            why = f"{why[:1].upper()}{why[1:]}."
+            why = f"{capitalized(why)}."
             raise DocumentError(f"{label} is not valid JSON", why) from error
     else:
         value = _load_yaml(data, label)

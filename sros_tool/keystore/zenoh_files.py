@@ -84,6 +84,7 @@ from sros_tool.translate_zenoh.rights import (
     stated_names,
 )
 from sros_tool.validity import iso
+from sros_tool.wording import capitalized
 from sros_tool.zenoh.access import (
     AccessControl,
     Flow,
@@ -1351,7 +1352,7 @@ def _vendors_differ_error(
         return PolicyError(
             f"{difference}, because DDS vendors do not "
             f"{'read the rules' if are_alike else 'decide'} alike",
-            f"{differing[:1].upper()}{differing[1:]}.",
+            f"{capitalized(differing)}.",
             _REMEDY_STATE_RIGHTS,
         )
     return PolicyError(

@@ -48,6 +48,7 @@ from sros_tool.pki.keys import (
 )
 from sros_tool.pki.tolerant import TolerantName
 from sros_tool.validity import Window
+from sros_tool.wording import capitalized
 
 # A permissions CA also signs governance and permissions documents.
 _CA_USAGE = tolerant.key_usage("digital_signature", "key_cert_sign", "crl_sign")
@@ -283,7 +284,7 @@ def _certificate_blocks(data: bytes, label: str) -> Iterator[pem_file.Block]:
     blocks, damage = _undamaged_blocks(data)
     yield from blocks
     if damage:
-        raise PkiError(label, _as_sentence(damage), _RESTORE)
+        raise PkiError(label, f"{capitalized(damage)}.", _RESTORE)
 
 
 @lru_cache(maxsize=8)  # several readers ask for the certificate of an enclave, or for all of them
@@ -348,10 +349,6 @@ def _listed_uses(uses: der.Value) -> set[str]:
     if uses.tag not in (der.SEQUENCE, der.CONTEXT_0):
         return set()
     return {der.decode_oid(use) for use in der.children(uses.content)}
-
-
-def _as_sentence(clause: str) -> str:
-    return f"{clause[:1].upper()}{clause[1:]}."
 
 
 def load_der_certificate(data: bytes) -> x509.Certificate:

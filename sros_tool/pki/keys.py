@@ -19,6 +19,7 @@ from sros_tool.pki import der
 from sros_tool.pki import pem as pem_file
 from sros_tool.pki.distinguished_names import reading
 from sros_tool.pki.tolerant import UnknownKey
+from sros_tool.wording import capitalized
 
 PrivateKey = ec.EllipticCurvePrivateKey | rsa.RSAPrivateKey
 PublicKey = ec.EllipticCurvePublicKey | rsa.RSAPublicKey
@@ -182,7 +183,7 @@ def check_key(content: bytes, label: str = "") -> None:
 
 def _unreadable_key_error(label: str, reason: str = "") -> PkiError:
     reason = reason or "it is not a PEM private key, or it is damaged"
-    why = f"{reason[:1].upper()}{reason[1:]}."
+    why = f"{capitalized(reason)}."
     return PkiError(f"the private key {label} cannot be read", why, "Restore it from a backup.")
 
 

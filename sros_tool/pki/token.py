@@ -498,7 +498,7 @@ def token_file_content(parsed: TokenUri) -> bytes:
     The line does not name the module: libp11 0.4.12 refuses this attribute, and takes the module
     from ``PKCS11_MODULE_PATH`` (libp11, eng_parse.c and eng_back.c).
     """
-    token, label = _percent_encoded(parsed.token), _percent_encoded(parsed.object)
+    token, label = quote(parsed.token, safe=""), quote(parsed.object, safe="")
     uri = f"{_SCHEME}token={token};object={label};type=private"
     if parsed.pin_source:
         uri += f"?pin-source=file:{quote(parsed.pin_source, safe='/')}"
@@ -529,10 +529,6 @@ def parse_token_file(data: bytes) -> TokenUri:
         return parse_enclave_uri(text, "")
     except UsageError as error:
         raise PkiError(error.what, error.what) from error
-
-
-def _percent_encoded(text: str) -> str:
-    return quote(text, safe="")
 
 
 def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:

@@ -19,6 +19,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from sros_tool.errors import DocumentError, UnavailableError, UsageError
+from sros_tool.wording import capitalized
 
 FOLDER, LINK, SUBMODULE = "40000", "120000", "160000"
 FILES = ("100644", "100755")
@@ -107,7 +108,7 @@ class Repository:
                 found = " ".join(filter(None, (option, self.commit(name))))
                 remedy = f"If git finds the right commit now, write `{found}`; otherwise {full}"
             except DocumentError as error:
-                why = f"{why} {error.what[:1].upper()}{error.what[1:]}. {error.why}".rstrip()
+                why = f"{why} {capitalized(error.what)}. {error.why}".rstrip()
                 remedy = f"Do not shorten the name: {full}"
             raise UsageError(
                 f"'{name}' is neither the full id of a commit nor a full reference", why, remedy

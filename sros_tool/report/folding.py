@@ -291,7 +291,7 @@ class _Draft:
             if classes:
                 self._classes = classes
                 return self._make_folding()
-        return _empty_folding(self._picture)
+        return Folding(self._picture, (), (), {}, {})
 
     def _has_marks(self) -> bool:
         texts = (
@@ -709,10 +709,6 @@ def _classes(views: Sequence[Counter[_Part]], before: Sequence[int]) -> dict[int
             key = before[unit], frozenset(view.items())
             classes[numbers.setdefault(key, len(numbers))].append(unit)
     return classes
-
-
-def _empty_folding(picture: Picture) -> Folding:
-    return Folding(picture, (), (), {}, {})
 
 
 # ── units ──────────────────────────────────────────────────────────────────────────────────

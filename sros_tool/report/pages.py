@@ -38,7 +38,7 @@ from sros_tool.report.picture import (
 from sros_tool.terminal import visible_json, visible_line
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import capitalized, counted, first_few
 
 _ASSETS = Path(__file__).with_name("assets")
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
@@ -297,7 +297,7 @@ def without_folders(value: Any, folders: Sequence[str]) -> Any:
 
 def _sentence(text: str) -> str:
     """Return ``text`` as a sentence in HTML, with a capital letter and a full stop; "" stays ""."""
-    return _with_marks(f"{text[:1].upper()}{text[1:].rstrip('.')}.") if text else ""
+    return _with_marks(f"{capitalized(text).rstrip('.')}.") if text else ""
 
 
 def _with_marks(text: str) -> str:
@@ -437,7 +437,7 @@ def _demo_scenario(scenario: Json, *, is_only: bool) -> str:
     is_good = good == len(rows) and not not_tried
     kind = ("good" if is_good and rows else "") if scenario["as_expected"] else "error"
     title = scenario["title"]
-    summary = f"<h2>{escape(title[:1].upper() + title[1:])}</h2>"
+    summary = f"<h2>{escape(capitalized(title))}</h2>"
     if not is_only:
         summary += f' <span class="chip {kind}">{good} of {len(rows)} as expected</span>'
         summary += f' <span class="chip warning">{opened} open</span>' if opened else ""

@@ -421,7 +421,7 @@ class _LetterSearch:
         self.effort_left -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
         if self.effort_left < 0:
             raise CannotSubtract
-        denied = tuple(chunk for chunk in denied if _overlap(chunk, wide))
+        denied = tuple(chunk for chunk in denied if chunks_intersect(_chunk(chunk), _chunk(wide)))
         if not denied:
             self._keep(read + wide)
             return ()
@@ -472,10 +472,6 @@ class _LetterSearch:
 
 def _chunk(text: str) -> str:
     return text.replace("*", ANY_PART)
-
-
-def _overlap(first: str, second: str) -> bool:
-    return chunks_intersect(_chunk(first), _chunk(second))
 
 
 def _rest_after_letter(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:

@@ -601,7 +601,8 @@ class _Verifier:
                 went_back = is_earlier_start = False
                 alternated = before.alternated if before else None
         # A new agent begins without a release, and a robot can only claim unpublished releases.
-        has_earlier_release = went_back and bool(installed) and self._is_published(before_it)
+        known = self._keystore.known_releases if went_back else ()
+        has_earlier_release = bool(installed) and before_it in known
         if has_earlier_release:
             alternated = arrived
         received = ReceivedConfirmation(
@@ -658,10 +659,6 @@ class _Verifier:
         """Return whether a certificate was issued after a message, according to the ledger."""
         issued = self._issue_entry(digest(certificate))
         return issued is not None and issued.time > iso(last.latest)
-
-    def _is_published(self, release: int) -> bool:
-        """Return whether the ledger has a release with this number."""
-        return release in self._keystore.known_releases
 
     def _arrival(
         self, file: _File, confirmation: Confirmation, last: ReceivedConfirmation | None

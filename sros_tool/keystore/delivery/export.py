@@ -582,7 +582,9 @@ def _write_folder(
             "Choose another folder.",
         )
     with Transaction(target, new_keystore=True, dry_run=dry_run) as transaction:
-        check_same_authority(target, files, earlier=_recorded_authorities(keystore))
+        check_same_authority(
+            target, files, earlier=frozenset(entry.sha256 for entry in keystore.entries_of("ca"))
+        )
         _check_robot(keystore, target, files)
         check_rollback(keystore, target, trust_files_in(target, files), files, now)
         check_own_keys(target, files)
@@ -605,11 +607,6 @@ def _write_folder(
             transaction.remove(path)
         transaction.commit()
     return transaction.changes
-
-
-def _recorded_authorities(keystore: OpenedKeystore) -> frozenset[str]:
-    """Return the SHA-256 of all CAs that the keystore has or had, as the ledger records them."""
-    return frozenset(entry.sha256 for entry in keystore.entries_of("ca"))
 
 
 def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, bytes]) -> None:

@@ -125,7 +125,7 @@ from sros_tool.values import (
     file_change,
     parse_json,
 )
-from sros_tool.wording import first_few
+from sros_tool.wording import capitalized, first_few
 from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
@@ -1125,7 +1125,7 @@ class _Publication:
                 if release.number != present_release.number:
                     raise DocumentError(f"the release of {robot} does not have the recorded number")
             except SrosError as error:
-                problem = problem or f"{error.what[:1].upper()}{error.what[1:]}."
+                problem = problem or f"{capitalized(error.what)}."
             else:
                 return release
         raise KeystoreError(

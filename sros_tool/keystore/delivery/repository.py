@@ -43,7 +43,7 @@ from sros_tool.keystore.delivery.published import (
     check_positive_number,
 )
 from sros_tool.keystore.delivery.release import release_target
-from sros_tool.wording import enumerated
+from sros_tool.wording import capitalized, enumerated
 from sros_tool.xml import read_bytes
 
 _ROOT, _TARGETS, _SNAPSHOT, _TIMESTAMP = Root.type, Targets.type, Snapshot.type, Timestamp.type
@@ -320,7 +320,7 @@ def read_present(folder: Path, roots: Roots) -> PresentMetadata:
 def _foreign_folder_error(folder: Path, why: str) -> KeystoreError:
     return KeystoreError(
         f"'{folder}' has metadata that this keystore did not write",
-        f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
+        f"{capitalized(why).removesuffix('.')}.",
         "If the keystore was restored from a backup, first follow docs/howto/keystore_is_lost.md. "
         "If this keystore published to this folder before, the metadata was changed or damaged: "
         "find out who else can write to the folder, "

@@ -75,7 +75,7 @@ from sros_tool.pki.crl import (
     signed_by,
 )
 from sros_tool.validity import BACKDATE, Window, iso
-from sros_tool.wording import counted
+from sros_tool.wording import capitalized, counted
 
 
 class LostRecords:
@@ -542,7 +542,7 @@ class RevocationListSigner:
             return SignedList(document, crl.next_update, entry)
         raise KeystoreError(
             "the revocation list of the CA service cannot be used",
-            f"{fault[:1].upper()}{fault[1:]}. Nothing was changed.",
+            f"{capitalized(fault)}. Nothing was changed.",
             remedy,
         )
 
