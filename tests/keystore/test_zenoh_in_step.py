@@ -14,7 +14,7 @@ from sros_tool.errors import PolicyError
 from sros_tool.files import templates_dir
 from sros_tool.keystore.lifecycle.update import set_zenoh
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.zenoh_files import rights_in_domain
+from sros_tool.keystore.zenoh_permissions import rights_in_domain
 from sros_tool.pki import smime
 from sros_tool.zenoh.configuration import ZenohNetwork
 from tests.support.harness import copy_of, policy_text, publish, snapshot, sros

@@ -17,7 +17,7 @@ from sros_tool.dds.domains import DomainRange, DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 from sros_tool.errors import DocumentError, PolicyError
-from sros_tool.keystore.zenoh_files import grant_for_all_vendors, rights_in_domain
+from sros_tool.keystore.zenoh_permissions import grant_for_all_vendors, rights_in_domain
 from sros_tool.names import dds_names
 from sros_tool.translate_zenoh.rights import remote_of
 from sros_tool.zenoh.access import AccessControl, Flow, Message
