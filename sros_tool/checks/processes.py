@@ -80,7 +80,7 @@ from sros_tool.runtime.processes import (
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, vendor_of
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.validity import Window, elapsed, iso, parse_iso
-from sros_tool.wording import enumerated, first_few
+from sros_tool.wording import counted, enumerated, first_few
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.document import ZenohEndpoint
 from sros_tool.zenoh.json5 import Json5Error, parse_json5
@@ -722,6 +722,21 @@ def _security_of(process: Process) -> Security:
     if vendor_of(process.rmw) is None:
         return Security.UNKNOWN
     return Security.OPEN if _why_unsecured(process) else Security.SECURED
+
+
+def security_counts_text(running: RunningProcesses) -> str:
+    """Return how many processes run secured and open, as a clause; "" without any process."""
+    counts = Counter(_security_of(node) for node in running.processes if not node.is_daemon)
+    texts = [f"{counts[Security.SECURED]} secured", f"{counts[Security.OPEN]} open"]
+    if unknown := counts[Security.UNKNOWN]:
+        texts.append(f"{unknown} perhaps open")
+    unseen = ""
+    if running.unseen or running.hidden:
+        number = "others" if running.hidden else counted(len(running.unseen), "other")
+        unseen = f" ({number} could not be examined)"
+    if not (counts or unseen):
+        return ""
+    return f"processes that use ROS 2, DDS or Zenoh: {', '.join(texts)}{unseen}"
 
 
 def process_findings(

@@ -714,6 +714,7 @@ def _machine_findings(
     ``libraries`` are installed DDS libraries, and ``advisories`` are the known vulnerabilities;
     None means the advisories that ship with sros.
     """
+    from sros_tool.checks.processes import security_counts_text
     from sros_tool.checks.runtime import RuntimeState, runtime_findings
     from sros_tool.cli.common import local_zone
     from sros_tool.runtime.processes import ProcessTable
@@ -725,6 +726,8 @@ def _machine_findings(
     state = RuntimeState(
         environment, moment, zone, running, rmws, insecure_rmws, clock, libraries, advisories
     )
+    if counts := security_counts_text(running):
+        echo(counts, err=True)
     return runtime_findings(state)
 
 

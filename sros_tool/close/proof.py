@@ -391,7 +391,8 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
 def _connecting_processes(running: RunningRobot) -> tuple[list[Process], list[Process]]:
     """Return the robot's processes, and further processes of its domain that trust the same CA.
 
-    The latter have other files, or only claim to run in an enclave. The observer is left out.
+    The latter have other files, or only claim to run in an enclave. The observer, and processes
+    with a revoked certificate, are left out.
     """
     own = [
         process
@@ -404,7 +405,10 @@ def _connecting_processes(running: RunningRobot) -> tuple[list[Process], list[Pr
         for _, group in group_by_authorities(
             process
             for process in running.in_domain
-            if process.enclave and process.enclave.name != OBSERVER and not process.is_daemon
+            if process.enclave
+            and process.enclave.name != OBSERVER
+            and not process.is_daemon
+            and not running.revokes(process.enclave)  # others rightly refuse it
         )
         for process in group
         if process.pid not in pids and any(member.pid in pids for member in group)
@@ -527,16 +531,25 @@ def _texts_of_all(
 
 
 def _proof_of_observed_processes(looks: Sequence[RunningRobot]) -> Iterator[Proof]:
-    """Yield an undecided proof if enclaves have processes that sros did not see when it watched."""
+    """Yield a proof if enclaves have processes that sros did not see when it watched.
+
+    It fails if one of them has a revoked certificate; otherwise, it is undecided.
+    """
+    revoked = _texts_of_all(partial(RunningRobot.with_other_files, revoked=True), looks)
     more = _texts_of_all(RunningRobot.not_observed, looks)
-    more += _texts_of_all(RunningRobot.with_other_files, looks)
+    more += _texts_of_all(partial(RunningRobot.with_other_files, revoked=False), looks)
+    reasons = []
+    if revoked:
+        have = "has a revoked certificate" if len(revoked) == 1 else "have revoked certificates"
+        names = first_few(revoked, MOST_NAMES)
+        reasons.append(f"{names} {have}: stop what is not yours, and export again what is yours")
     if more:
-        yield Proof(
-            KNOWN,
-            None,
+        reasons.append(
             f"sros did not see {first_few(more, MOST_NAMES)} when it watched, and each process has "
-            "all rights of its enclave: stop what is not yours",
+            "all rights of its enclave: stop what is not yours"
         )
+    if reasons:
+        yield Proof(KNOWN, False if revoked else None, "; ".join(reasons))
 
 
 def _proof_of_domains(looks: Sequence[RunningRobot]) -> Iterator[Proof]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+from sros_tool.checks.keystores.trust import revoked_enclaves
 from sros_tool.checks.processes import (
     PLACE_OR_MODE,
     newer_files,
@@ -30,6 +32,7 @@ from sros_tool.close.processes import (
     process_text,
 )
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot, check_enclaves
+from sros_tool.errors import SrosError
 from sros_tool.keystore.expiry import Threshold, survey
 from sros_tool.keystore.known_keys import IssuedCredentials
 from sros_tool.keystore.layout import (
@@ -250,14 +253,30 @@ class RunningRobot:
         }
         return {name: [*dict.fromkeys(fitting)] for name, fitting in pids.items() if fitting}
 
-    def with_other_files(self) -> Iterator[str]:
-        """Yield the processes of the domain in enclaves of other folders, as text."""
+    def with_other_files(self, *, revoked: bool) -> Iterator[str]:
+        """Yield the processes of the domain in enclaves of other folders, as text.
+
+        Only those whose certificate is ``revoked``, or only the others.
+        """
         pids = {process.pid for process, _ in self.secured}
         for process in self.in_domain:
             enclave = process.enclave
-            if enclave and process.pid not in pids:
+            if enclave and process.pid not in pids and revoked == self.revokes(enclave):
                 files = keystore_text(enclave)
                 yield f"{process.label} in {enclave.name} (with the files of '{files}')"
+
+    def revokes(self, enclave: ProcessEnclave) -> bool:
+        """Return whether the export's revocation list has the certificate of a process's enclave.
+
+        The certificate is the one that is now in the enclave's folder; a folder that sros cannot
+        read counts as not revoked.
+        """
+        list_file = enclave_path(self.robot.export, OBSERVER) / CRL_FILE
+        with suppress(SrosError):
+            data = OpenedKeystore(self.robot.export).read(list_file, "revocation list")
+            if folder := enclave.local_keystore:
+                return any(revoked_enclaves(data, OpenedKeystore(folder), [enclave.name]))
+        return False
 
     def further_processes(
         self, secured: Sequence[SecuredProcess], observed: ObservedProcesses

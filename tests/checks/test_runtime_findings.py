@@ -18,7 +18,7 @@ import pytest
 from sros_tool.checks import processes, runtime
 from sros_tool.checks.environment import security_clauses
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingFilter
-from sros_tool.checks.processes import may_lack_list
+from sros_tool.checks.processes import may_lack_list, security_counts_text
 from sros_tool.checks.runtime import RuntimeState
 from sros_tool.keystore.layout import CERTIFICATE_FILE, CRL_FILE
 from sros_tool.runtime.processes import (
@@ -28,6 +28,7 @@ from sros_tool.runtime.processes import (
     ProcessEnclave,
     ProcessTable,
     RunningProcesses,
+    UnseenProcess,
 )
 from sros_tool.runtime.rmw import RMW
 from sros_tool.zenoh.json5 import MOST_BYTES
@@ -106,6 +107,24 @@ def test_without_security_each_open_node_is_named(sound_one: RuntimeState, bench
         chosen = FindingFilter(severity=severity).choose([found])
         assert bool(chosen.shown) is shown
         assert not chosen.fails(WARNING)
+
+
+def test_the_first_line_counts_what_runs_open(sound_one: RuntimeState) -> None:
+    (secured,) = sound_one.running.processes[:1]
+    opened = replace(secured, environment={})
+    on_email = {**secured.environment, "RMW_IMPLEMENTATION": "rmw_email_cpp"}
+    email = replace(secured, environment=on_email, libraries=frozenset({"librcl"}))
+    daemon = replace(opened, command=("/bin/python", "/bin/_ros2_daemon"))
+    unseen = UnseenProcess(7, ("x",), "it is of another user", False)
+    begin = "processes that use ROS 2, DDS or Zenoh: "
+    for nodes, more, text in (
+        ((secured, secured), {}, f"{begin}2 secured, 0 open"),
+        ((secured, opened, email, daemon), {}, f"{begin}1 secured, 1 open, 1 perhaps open"),
+        ((), {"unseen": (unseen,)}, f"{begin}0 secured, 0 open (1 other could not be examined)"),
+        ((), {"hidden": "x"}, f"{begin}0 secured, 0 open (others could not be examined)"),
+        ((daemon,), {}, ""),
+    ):
+        assert security_counts_text(RunningProcesses(nodes, **more)) == text
 
 
 @pytest.mark.parametrize("written", ["7", "07", "0x7", "7abc", "4294967303"])

@@ -2476,9 +2476,20 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
         "no: the files are not accepted: the keystore has /operator/look, and the policy" in proved
     )
     assert "(types are not compared), without /operator/look\n" in proved
+    sros("distribute_key", "robot/keystore", "/operator/look", "stolen", cwd=robot.folder).ok()
     sros("revoke", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
     assert "\nnot on this machine: /listener (to " in robot.close().out
     assert "/operator/look" not in robot.close("--proof").out
+    thief = replace(
+        robot.process("/talker", is_secured=True),
+        pid=9,
+        environment=secured_environment(robot.folder / "stolen", "/operator/look", 0),
+    )
+    robot.more = (robot.with_its_files(thief),)
+    refused = "no: not every process in an enclave belongs there: process 9 (run) in /operator/look"
+    files = f"(with the files of '{robot.folder}/stolen') has a revoked certificate: stop what is"
+    assert f"{refused} {files} not yours" in robot.close("--proof", status=1).out
+    robot.more = ()
     sros("create_enclave", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
     robot.close("--elsewhere", "/operator/look", status=1)
     robot.by_hand = set()

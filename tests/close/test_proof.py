@@ -219,6 +219,7 @@ def test_processes_that_have_not_connected_fail_the_proof(
         in_domain=in_domain,
         secured=[(process, process.enclave) for process in in_domain if process.pid != FOREIGN],
         may_use_files=lambda process: process.pid not in (OF_OTHERS, FOREIGN),
+        revokes=lambda enclave: False,
     )
     monkeypatch.setattr(
         proof,

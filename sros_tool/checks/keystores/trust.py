@@ -262,7 +262,7 @@ def _revoked_findings(targets: Targets) -> Iterator[Finding]:
     revocations: dict[tuple[str, tuple[str, ...]], dict[str, None]] = defaultdict(dict)
     for data, of_list in holders.items():
         for shown, target in targets.items():
-            if shown not in of_list and (names := tuple(_revoked_enclaves(data, *target))):
+            if shown not in of_list and (names := tuple(revoked_enclaves(data, *target))):
                 revocations[shown, names].update(of_list)
     for (shown, names), of_lists in revocations.items():
         text = (
@@ -273,7 +273,7 @@ def _revoked_findings(targets: Targets) -> Iterator[Finding]:
         yield PEERS_REVOKED.found(shown, text, shown)
 
 
-def _revoked_enclaves(
+def revoked_enclaves(
     list_data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str]
 ) -> Iterator[str]:
     """Yield those of ``enclaves`` whose certificates a revocation list revokes."""
