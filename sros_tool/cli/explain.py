@@ -1138,7 +1138,6 @@ def _show_log(
     print_notes([note for note in explained.notes if note.id == "log.other-folder"])
     for finding in explained.findings:
         _echo_answer(_finding_lines(finding))
-    print_notes([note for note in explained.notes if note.id != "log.other-folder"])
     if explained.secured is False and not explained.findings:
         if_on_zenoh = "" if os.environ.get(RMW) else _IF_ON_ZENOH
         echo(f"{_NOT_SHOWN_SECURED}{if_on_zenoh}" if text.strip() else _EMPTY_LOG)
@@ -1148,6 +1147,7 @@ def _show_log(
             echo(line, err=True)
         if _ZENOH_TESTS in text:
             echo(_ONLY_TESTS, err=True)
+    print_notes([note for note in explained.notes if note.id != "log.other-folder"])
     return status
 
 
@@ -1181,7 +1181,7 @@ def _lines_without_findings(log: str, count: int) -> Iterator[str]:
         yield not_found
         yield f"not shown: {_PERHAPS_OPEN}; {_SILENT_ON_ZENOH}"
     elif match := next(filter(None, map(security_directory, log_lines(plain_text(log)))), None):
-        yield f"{not_found}; a node found its enclave '{match['folder']}'"
+        yield f"{not_found}; the log says that a node found its enclave '{match['folder']}'"
         yield (
             "not shown: whether peers drop the node's messages (explain the peers' logs, or "
             f"compare keystores: `sros check FOLDER OTHER`); {_SILENT_ON_ZENOH}"

@@ -167,7 +167,10 @@ def explain_log_file(
         secured = any(is_named(enclave) for enclave, _ in started)
     examined = named.folder if named and not keystore else keystore and keystore.root
     notes = [*_other_folder_notes(examined, [folder for _, folder in started])] if examined else []
-    notes += _NOTES if any(finding.found for finding in findings) else ()
+    if any(finding.found for finding in findings):
+        notes.append(_note_on_text(_ONLY_FOUND))
+    elif started and not findings and secured is not False:
+        notes.append(_note_on_text(_NO_PROOF))
     return ExplainedLog(log, findings, secured, notes)
 
 
@@ -190,13 +193,15 @@ def _other_folder_notes(examined: Path, folders: Iterable[str]) -> Iterator[Note
         yield Note("log.other-folder", f"the log names another folder than {examined}: {shown}")
 
 
-_NOTES = (
-    Note(
-        "log.only-text",
-        "a process can print any line, true or false: only the rows 'found' are what sros itself "
-        "found in the enclave",
-    ),
+_ONLY_FOUND = "only the rows 'found' are what sros itself found in the enclave"
+_NO_PROOF = (
+    "this log does not prove that its node runs secured. An open listener in the same domain has "
+    "to hear nothing from the node: `sros demo listener --topic NAME --for 10s`"
 )
+
+
+def _note_on_text(text: str) -> Note:
+    return Note("log.only-text", f"a process can print any line, true or false: {text}")
 
 
 def explain_log(

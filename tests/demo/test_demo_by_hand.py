@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -211,7 +212,10 @@ def test_a_node_by_hand_ends_with_what_it_heard_and_saw(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Also messages that it reports only when it ends; a text that looks like a sum is one."""
+    """Also messages that it reports only when it ends; a text that looks like a sum is one.
+
+    The page on continuous integration looks for this line.
+    """
     node, lines = tmp_path / "node", list[str]()
     node.write_text(_NODE.replace("SEEN", seen))
     node.chmod(0o755)
@@ -227,7 +231,12 @@ def test_a_node_by_hand_ends_with_what_it_heard_and_saw(
         run_by_hand(HandNode(role, "cyclone", "/odom"), say, duration)
         return lines
 
-    assert apart(played)[-1] == f"stopped; {result}"
+    last = apart(played)[-1]
+    assert last == f"stopped; {result}"
+    page = (Path(__file__).parents[2] / "docs/howto/ci.md").read_text()
+    hears, hears_nothing = re.findall(r"tail -n 1 \w+\.log \| grep '(.*)'", page)
+    assert bool(re.search(hears, last)) == ("heard 7" in result)
+    assert bool(re.search(hears_nothing, last)) == ("heard 0" in result)
 
 
 def test_a_node_by_hand_says_what_others_have_of_another_type(tmp_path: Path) -> None:

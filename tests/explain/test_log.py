@@ -677,11 +677,14 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
     for found in ("[INFO] [1.0] [rcl]: Found", "[talker]"):  # rcl, and a node of `sros demo`
         line = f"{found} security directory: /k/enclaves/talker\n"
         ended = said_of(line, tmp_path).ok()
-        first, second = ended.err.splitlines()
-        assert first == f"{none} 1 line; a node found its enclave '/k/enclaves/talker'"
+        first, second, third = ended.err.splitlines()
+        said = f"{none} 1 line; the log says that a node found its enclave '/k/enclaves/talker'"
+        assert first == said
         assert second.startswith("not shown: whether peers drop the node's messages (explain the")
         assert "`sros check FOLDER OTHER`" in second
         assert len(second) < 200
+        assert third.startswith("note [log.only-text]: a process can print any line, true or false")
+        assert "this log does not prove that its node runs secured. An open listener" in third
 
 
 STARTED = "[INFO] [1.0] [rcl]: Found security directory: {}/enclaves{}\n"
