@@ -341,9 +341,7 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
             OLD_COPY,
         )
     if isinstance(error, exceptions.DownloadLengthMismatchError):
-        return FetchError(
-            FetchProblem.TOO_LARGE, f"a file from {source} is too large", why, "Nothing was kept."
-        )
+        return _altered_files_error(FetchProblem.TOO_LARGE, source, why)
     status = error.status_code if isinstance(error, exceptions.DownloadHTTPError) else 0
     if status in REFUSALS or is_tls_ended_by_server(error.__cause__):
         return FetchError(
@@ -370,8 +368,12 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
             why,
             "Make room on the disk, and let the agent write in its folder.",
         )
+    return _altered_files_error(FetchProblem.NOT_SIGNED, source, why)
+
+
+def _altered_files_error(problem: FetchProblem, source: str, why: str) -> FetchError:
     return FetchError(
-        FetchProblem.NOT_SIGNED,
+        problem,
         f"the files in {source} are damaged, or not signed with the trusted keys",
         f"{why} Probably a published file was damaged or altered. This robot keeps its files.",
         "On the keystore machine, run `sros fleet publish KEYSTORE PUB`, which puts altered files "

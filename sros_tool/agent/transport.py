@@ -11,8 +11,9 @@ import errno
 import http.client
 import ssl
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import IO
 from urllib.parse import urlsplit
 
 from tuf.api.exceptions import (
@@ -30,7 +31,23 @@ from sros_tool.folders import Folder
 _BLOCK_BYTES = 1 << 16
 
 
-class FolderTransport(FetcherInterface):
+class _Transport(FetcherInterface):
+    """A TUF fetcher that names the file whose size is wrong."""
+
+    base: str
+
+    @contextmanager
+    def download_file(self, url: str, max_length: int) -> Iterator[IO[bytes]]:
+        try:
+            with super().download_file(url, max_length) as file:
+                yield file
+        except DownloadLengthMismatchError as error:
+            path = url.removeprefix(f"{self.base}/")
+            text = f"the file {path} is larger than the {max_length} bytes that it may have"
+            raise DownloadLengthMismatchError(text) from error
+
+
+class FolderTransport(_Transport):
     """A TUF fetcher for a publishing folder on this machine, such as on a USB stick."""
 
     base = "folder:"
@@ -61,7 +78,7 @@ class FolderTransport(FetcherInterface):
                 raise DownloadError(error.what) from error
 
 
-class HttpTransport(FetcherInterface):
+class HttpTransport(_Transport):
     """A TUF fetcher for a publishing folder on a web server, over one connection.
 
     The ``connection`` has to be entered, and is cut off after some minutes.

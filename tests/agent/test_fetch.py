@@ -324,7 +324,9 @@ def test_endless_data(publisher: Home) -> None:
 
     with serving(partial(Endless, directory=str(publisher.pub))) as address:
         for Endless.endless in ("/timestamp.json", "/1.snapshot.json", ".r1.tar.gz"):
-            publisher.robot().refuses(FetchProblem.TOO_LARGE, address)
+            refused = publisher.robot().refuses(FetchProblem.TOO_LARGE, address)
+            assert "puts altered files right" in refused.remedy
+            assert f"{Endless.endless} is larger than the " in refused.why
         Endless.endless = "nothing"
         publisher.robot().gets(address)
 
@@ -332,7 +334,8 @@ def test_endless_data(publisher: Home) -> None:
 def test_large_files_in_a_folder(publisher: Home) -> None:
     with (publisher.pub / "metadata/timestamp.json").open("ab") as file:
         file.truncate(1 << 31)
-    publisher.robot().refuses(FetchProblem.TOO_LARGE)
+    refused = publisher.robot().refuses(FetchProblem.TOO_LARGE)
+    assert refused.why.startswith("The file metadata/timestamp.json is larger than the ")
 
 
 @pytest.mark.parametrize(
