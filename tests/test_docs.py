@@ -176,6 +176,15 @@ def test_the_workflow_of_a_package_sees_other_policies(
     assert done.returncode == status, done
 
 
+def test_no_start_limit_stops_the_path_units_of_pages() -> None:
+    """A service that reaches its limit also stops its path unit, until somebody restarts it."""
+    fences = [fence for document in DOCUMENTS for fence in FENCE.findall(read(document))]
+    names = re.findall(r"^# (\S+)\.path$", "\n".join(fences), re.MULTILINE)
+    services = [each for each in fences for name in names if f"\n# {name}.service\n" in each]
+    assert len(services) == len(names) > 0
+    assert all("\nStartLimitIntervalSec=0\n" in service for service in services)
+
+
 def test_the_changelog_is_about_this_version() -> None:
     version = tomllib.loads(read("pyproject.toml"))["project"]["version"]
     changelog = read("CHANGELOG.md")
