@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.harness import policy_text, publish, snapshot, sros, subscribe
+from tests.support.harness import copy_of, policy_text, publish, snapshot, sros, subscribe
 
 FLEET = """
 [groups]
@@ -307,6 +307,23 @@ def test_check_wants_the_domain_that_the_keystore_has_for_a_robot(tmp_path: Path
     for fleet in ("f.toml", "moved.toml"):
         checked = sros("check", "ks", "--policy", "new.xml", "--fleet", fleet, cwd=tmp_path)
         assert "are for domain 10,20, but its robot is in domain 10\n" in checked.out, fleet
+
+
+def test_the_domains_of_a_robot_that_left_are_shown_with_their_cause(
+    halls: Path, tmp_path: Path
+) -> None:
+    """Without the fleet file, the robot's domain is unknown; the remedy is not to sign again."""
+    folder = copy_of(halls, tmp_path / "halls")
+    (folder / "f.toml").write_text(re.sub("p01 = .*\n", "", FLEET))
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", "--fleet", "f.toml", cwd=folder).ok()
+    shown = sros("check", "ks", cwd=folder).out
+    assert "Enclaves of p01: /p01/eye, /p01/wheels. Other robots still accept" in shown
+    assert "found: permissions and governance for different domains (2 times)" in " ".join(
+        shown.split()
+    )
+    assert "Revoke the enclaves with" in shown and "Sign both" not in shown
+    alone = sros("check", "ks", "--exclude", "keystore.robot-left", cwd=folder).out
+    assert "Sign both for the same domains" in alone, "nothing is hidden without its cause"
 
 
 @pytest.mark.parametrize("verb", ["sign_request", "create_permission"])

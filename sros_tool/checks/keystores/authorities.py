@@ -404,9 +404,8 @@ _SHOWN, _MOST_LEFT = 5, 20
 
 def _former_robot_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
     from sros_tool.fleet.robots import former_robot_of
-    from sros_tool.keystore.fleet import left_enclaves
 
-    left = left_enclaves(keystore.opened, fleet, keystore.at.now)
+    left = keystore.left_enclaves
     former = {name: former_robot_of(fleet, name) for name in keystore.names if name not in left}
     for kind, enclaves in ((ROBOT_LEFT, left), (LEFT_ENCLAVES, former)):
         robots: dict[str, list[str]] = {}

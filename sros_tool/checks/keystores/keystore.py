@@ -13,9 +13,10 @@ from shlex import quote
 
 from sros_tool.checks import upgrade
 from sros_tool.checks.keystores import zenoh_files
-from sros_tool.checks.keystores.authorities import ONE_AUTHORITY, check_authorities
+from sros_tool.checks.keystores.authorities import ONE_AUTHORITY, ROBOT_LEFT, check_authorities
 from sros_tool.checks.keystores.documents import (
     DIFFERS,
+    DOMAINS,
     TIME_FORMAT,
     check_documents,
     check_governance,
@@ -69,7 +70,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedKeystore, read_consistently
 from sros_tool.parallel import map_slices, tick
 from sros_tool.policy.rights import Right
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import capitalized, counted, first_few
 
 _NAMES_SHOWN = 3
 _IDS_WITH_KEYSTORE_CAUSE = frozenset(
@@ -189,6 +190,7 @@ def keystore_findings(
     )
     if not keystore.is_original:
         return all_findings
+    all_findings = _with_cause_of_left_robots(all_findings, keystore)
     return _with_cause_of_expiry(_with_cause_of_ros2(all_findings, opened), opened)
 
 
@@ -387,6 +389,29 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
         f"If your team made an enclave, state its rights with `{command}`, which also issues its "
         "certificate again. Otherwise, somebody else has the CA key: revoke the enclave, and "
         "replace the CA (`sros rotate_ca`).",
+    )
+
+
+def _with_cause_of_left_robots(
+    findings: Sequence[Finding], keystore: CheckedKeystore
+) -> list[Finding]:
+    """Return the findings, with a cause for domains that only a robot of the fleet has."""
+    left = [finding for finding in findings if finding.kind is ROBOT_LEFT]
+    domains = [
+        finding
+        for finding in findings
+        if finding.kind is DOMAINS and finding.subject in keystore.left_enclaves
+    ]
+    if not (left and domains):
+        return list(findings)
+    robots = "; ".join(finding.text for finding in left)
+    return _with_cause(
+        findings,
+        [*left, *domains],
+        keystore.opened,
+        ROBOT_LEFT.title,
+        f"{capitalized(robots)}. {ROBOT_LEFT.why} Also found: {_kinds_text(domains)}.",
+        left[0].remedy,
     )
 
 

@@ -18,7 +18,7 @@ from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.fleet import fleet_edits_clause, load_fleet
+from sros_tool.keystore.fleet import fleet_edits_clause, left_enclaves, load_fleet
 from sros_tool.keystore.layout import (
     CRL,
     FLEET,
@@ -170,6 +170,11 @@ class CheckedKeystore:
     def fleet(self) -> Fleet | None:
         """The robots of the keystore, or None if it has no fleet."""
         return self._part(FLEET, lambda: load_fleet(self.opened), None)
+
+    @cached_property
+    def left_enclaves(self) -> dict[str, str]:
+        """The enclaves of robots that left the fleet, or their group, with these robots."""
+        return left_enclaves(self.opened, self.fleet, self.at.now) if self.fleet else {}
 
     @cached_property
     def fleet_edits(self) -> str:
