@@ -245,6 +245,7 @@ def close(
 def _show(robot: LocalRobot, closed: CloseState) -> None:
     """Print on one screen who may do what, how processes are restarted, and what looks wrong."""
     from sros_tool.close.rights import access_lines
+    from sros_tool.keystore.known_keys import revoked_entries
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.document import read_policy
@@ -292,7 +293,10 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
             f"not on this machine: {', '.join(not_here)} (to bring an enclave to its machine: "
             f"{bring})"
         )
-    if dropped := robot.processes.enclaves_outside(policy):
+    revoked = {entry.enclave for entry in revoked_entries(keystore)}
+    if dropped := [
+        name for name in robot.processes.enclaves_outside(policy) if name not in revoked
+    ]:
         echo(f"the policy lacks enclaves that sros saw when it watched: {', '.join(dropped)}")
     for right in closed.newly_denied[:_MOST_DENIED]:
         echo(f"the policy now denies a right that the robot used when sros watched: {right}")

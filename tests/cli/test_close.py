@@ -1658,6 +1658,12 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     assert "not in the policy" not in said
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert "/talker -- /opt/run talker\n" in commands
+    robot.absent, policy = {"/talker"}, robot.folder / "robot/policy.xml"
+    talker = r'(?s)<enclave path="/talker">.*?</enclave>'
+    policy.write_text(re.sub(talker, "", policy.read_text()))
+    assert "saw when it watched: /talker\n" in robot.close(status=1).out
+    sros("revoke", "robot/keystore", "/talker", cwd=robot.folder).ok()
+    assert "saw when it watched" not in robot.close().out, "the user took the enclave out"
 
 
 def test_a_node_whose_enclave_the_graph_does_not_show_is_named(robot: Robot) -> None:
