@@ -378,7 +378,7 @@ class _RemainingProcesses:
 
     def further_secured_processes(self) -> Iterator[str]:
         """Yield a text for each process in an enclave that was not observed for this enclave."""
-        known = {process.enclave for process in self._observed.processes}
+        known = self._observed.enclaves
         for enclave in sorted(self._secured.keys() - known):
             process = self._secured[enclave]
             remedy = f"restart process {process.pid} open: {process_text(process)}"

@@ -211,7 +211,7 @@ def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> Ob
         for old, new in zip(nodes.as_observed, nodes.in_their_enclaves, strict=True):
             moved.setdefault(old.enclaves[0], set()).add(new.enclaves[0])
     origins = Counter(chain.from_iterable(moved.values()))
-    taken = {process.enclave for process in observed.processes}
+    taken = observed.enclaves
     renamed = []
     for process in observed.processes:
         name, *others = moved.get(process.enclave, {process.enclave})

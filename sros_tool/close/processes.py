@@ -386,6 +386,11 @@ class ObservedProcesses(NamedTuple):
     """
 
     @property
+    def enclaves(self) -> set[str]:
+        """The enclaves of the processes."""
+        return {process.enclave for process in self.processes}
+
+    @property
     def units(self) -> set[str]:
         """The systemd units that each start a single process, and that --apply restarts."""
         return {process.unit for process in self.processes if not process.is_by_hand}

@@ -107,7 +107,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     unsigned_text = cache(partial(_unsigned_policy_text, robot))
     if OBSERVER in expired:
         return [_proof_of_files(robot, expired, unsigned_text)]
-    expected = {process.enclave for process in state.observed.processes} | {*state.new}
+    expected = state.observed.enclaves | {*state.new}
     if not expected:
         return [Proof(STARTED, False, "no process of the robot is known")]
     running = wait_until(robot, lambda seen: seen.current_enclaves >= expected, patience)

@@ -227,7 +227,7 @@ class RunningRobot:
         """
         secured = [secured for secured in self.secured if secured.enclave.name != OBSERVER]
         observed = self.robot.processes
-        known = {process.enclave for process in observed.processes}
+        known = observed.enclaves
         count = Counter(
             name for name, _ in {(enclave.name, process.program[0]) for process, enclave in secured}
         )
@@ -669,7 +669,7 @@ class CloseState(NamedTuple):
     @property
     def pending(self) -> Sequence[str]:
         """The enclaves that should have a process with the current files, and have none."""
-        names = {process.enclave for process in self.observed.processes} | {*self.new}
+        names = self.observed.enclaves | {*self.new}
         names = names.difference(self.without) | self.secured.keys()
         return sorted(name for name in names if not self.secured.get(name))
 
@@ -746,7 +746,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         )
         if name in secured
     }
-    known = {process.enclave for process in observed.processes} | secured.keys()
+    known = observed.enclaves | secured.keys()
     check_enclaves(robot.without, known | new.keys() | robot.not_here, "--without")
     outside = robot.enclaves_outside_policy() if policy else ()  # the policy may be broken
     changed_at = {
@@ -801,13 +801,9 @@ def _new_enclaves(
 
     Processes run in the enclaves ``secured``. Before a watch, the result is empty.
     """
-    known = {process.enclave for process in observed.processes}
-    known |= {*secured, *observed.elsewhere, *robot.not_here, OBSERVER}
-    return {
-        enclave.path: {profile.full_name for profile in enclave.all_profiles()}
-        for enclave in policy.enclaves
-        if robot.observed and enclave.path not in known
-    }
+    known = {*observed.enclaves, *secured, *observed.elsewhere, *robot.not_here, OBSERVER}
+    nodes = policy.nodes() if robot.observed else {}
+    return {enclave: names for enclave, names in nodes.items() if enclave not in known}
 
 
 def _movable_enclaves(
@@ -824,11 +820,7 @@ def _movable_enclaves(
         if process.is_idle and process.enclave not in secured and count[process.enclave] == 1
         if not (process.unit or process.launch or process.container or process.shares)
     }
-    return {
-        enclave.path: {profile.full_name for profile in enclave.all_profiles()}
-        for enclave in policy.enclaves
-        if enclave.path in movable
-    }
+    return {enclave: names for enclave, names in policy.nodes().items() if enclave in movable}
 
 
 def _valid_until(robot: LocalRobot) -> datetime | None:

@@ -169,7 +169,7 @@ def _write_observation(robot: LocalRobot, document: str, observed: ObservedProce
     Raises:
         UsageError: an option names an enclave that the robot does not have.
     """
-    enclaves_here = {process.enclave for process in observed.processes}
+    enclaves_here = observed.enclaves
     not_here = (robot.not_here - enclaves_here).union(robot.named_elsewhere)
     if robot.observed is None:  # otherwise checked before the watch
         robot.check_machines()
