@@ -279,9 +279,8 @@ def read_policy(path: AnyPath) -> Policy:
     """Return the policy in the file ``path``, with the files that it includes.
 
     Raises:
-        PolicyError: The policy is malformed, contradicts itself, or includes a file outside of its
-            folder.
-        DocumentError: The file cannot be read.
+        PolicyError: The policy does not exist or cannot be read, is no XML or malformed,
+            contradicts itself, or includes a file outside of its folder.
 
     Example:
         >>> policy = sros_tool.read_policy("policies/talker_listener.xml")
@@ -312,7 +311,7 @@ def policy_rights(policy: AnyPath | Policy) -> tuple[Right, ...]:
         "publish") and ``name``, perhaps with wildcards.
 
     Raises:
-        PolicyError: (or another `DocumentError`) The policy cannot be read.
+        PolicyError: The policy cannot be read.
 
     Example:
         >>> [str(right) for right in sros_tool.policy_rights(policy) if right.name == "/chatter"]

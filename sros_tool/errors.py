@@ -53,7 +53,7 @@ class DocumentError(SrosError):
 
 
 class PolicyError(DocumentError):
-    """A policy file that is malformed or contradicts itself."""
+    """A policy file that cannot be read, is malformed or contradicts itself."""
 
 
 class PkiError(SrosError):

@@ -183,6 +183,28 @@ def test_the_rights_of_a_policy_have_absolute_names(tmp_path: Path) -> None:
     assert sros_tool.explain_access(policy, "/a", "publish", "/x")
 
 
+def test_every_policy_that_cannot_be_read_is_the_same_kind_of_error(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "link").mkdir()
+    (tmp_path / "link" / "inner").symlink_to(tmp_path / "empty")
+    for name, content in (
+        ("gone.xml", None),
+        ("not_closed.xml", "<policy><x/>"),
+        ("nothing.xml", ""),
+        ("latin.xml", "<?xml version='1.0' encoding='UTF-7'?><policy/>"),
+        ("other.xml", "<profile/>"),
+        ("old.xml", policy_text({"/a": publish("/x")}).replace("0.2.0", "0.1.0")),
+        ("empty", None),
+        ("link", None),
+        ("empty/..", None),
+    ):
+        if content is not None:
+            (tmp_path / name).write_text(content)
+        for read in (sros_tool.read_policy, sros_tool.policy_rights):
+            with pytest.raises(PolicyError):
+                read(tmp_path / name)
+
+
 def test_findings_are_for_the_nodes_of_a_distribution(tmp_path: Path) -> None:
     policy = tmp_path / "robot.xml"
     policy.write_text(policy_text({"/a": publish("/x")}))

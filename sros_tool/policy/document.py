@@ -421,20 +421,27 @@ def read_policy(
         may_be_empty: accept a file without enclaves, to which the caller adds enclaves.
 
     Raises:
-        PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
-            a name is not a valid ROS name, or an enclave is defined twice.
+        PolicyError: (with file and line, if possible) the file cannot be read, is no XML or
+            violates the format, a name is not a valid ROS name, or an enclave is defined twice.
     """
-    if content is None and policy_files is None and os.path.isdir(path):  # noqa: PTH112 - as `_file_exists`
-        files = list(files_of_policies(path))
-        if not files:
-            raise PolicyError(
-                f"'{path}' holds no policy", "", "Name a policy, or a folder of them."
-            )
-        joined = join_policies([read_policy(file, placeholders=placeholders) for file in files])
-        return replace(joined, file=str(path))
-    reader = _Reader(path, content, placeholders=placeholders, policy_files=policy_files)
-    reader.may_be_empty = may_be_empty
-    return reader.policy()
+    try:
+        if content is None and policy_files is None and os.path.isdir(path):  # noqa: PTH112 - as `_file_exists`
+            return _read_folder(path, placeholders=placeholders)
+        reader = _Reader(path, content, placeholders=placeholders, policy_files=policy_files)
+        reader.may_be_empty = may_be_empty
+        return reader.policy()
+    except PolicyError:
+        raise
+    except DocumentError as error:
+        raise PolicyError(error.what, error.why, error.remedy) from error
+
+
+def _read_folder(path: Path, *, placeholders: bool) -> Policy:
+    files = list(files_of_policies(path))
+    if not files:
+        raise PolicyError(f"'{path}' holds no policy", "", "Name a policy, or a folder of them.")
+    joined = join_policies([read_policy(file, placeholders=placeholders) for file in files])
+    return replace(joined, file=str(path))
 
 
 def refuse_fallbacks(policy: Policy) -> None:
