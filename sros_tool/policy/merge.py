@@ -519,7 +519,8 @@ def _texts_on_shared_enclaves(before: Policy, additions: Policy, after: Policy) 
                     f"{enclave.path} already has a node {node}, and the merged policy gives the "
                     "node entirely different rights. If these are two programs, each of them now "
                     "has the rights of both: then merge with another --namespace, or with "
-                    "--enclave and --remap __node:=NAME."
+                    "--enclave and --remap __node:=NAME. If they are two versions of one program, "
+                    "ignore this note."
                 )
 
 

@@ -111,7 +111,9 @@ def test_a_merge_notes_a_node_of_another_package_with_the_same_name(folder: Path
         (("robot.xml", "water.xml", "--namespace", "/left"), False),
         (("robot.xml", "water.xml", "--enclave", "/w", "--remap", "__node:=w"), False),
     ):
-        assert (SHARED in sros("merge_policy", *words).ok().err) == said, words
+        err = sros("merge_policy", *words).ok().err
+        assert (SHARED in err) == said, words
+        assert ("If they are two versions of one program, ignore this note." in err) == said, words
 
 
 def test_the_nodes_of_a_package_are_merged_into_the_enclave_that_composes_them(
