@@ -658,7 +658,7 @@ def _findings(family: str, paths: tuple[Path, ...], circumstances: Circumstances
     from sros_tool.keystore.layout import is_keystore
 
     if family == "runtime":
-        return _runtime(circumstances)
+        return _runtime(circumstances, says_counts=True)
     if family == "policy":
         if not paths:
             raise UsageError("no policy is named", "", "Name a file, or a folder of policies.")
@@ -687,12 +687,13 @@ def _findings(family: str, paths: tuple[Path, ...], circumstances: Circumstances
     return list(dict.fromkeys(findings))
 
 
-def _runtime(circumstances: Circumstances) -> list[Finding]:
+def _runtime(circumstances: Circumstances, *, says_counts: bool = False) -> list[Finding]:
     return _machine_findings(
         _environment(circumstances.domain),
         circumstances.now,
         {},
         advisories=circumstances.advisories,
+        says_counts=says_counts,
     )
 
 
@@ -707,12 +708,15 @@ def _machine_findings(
     insecure_rmws: Mapping[str, str],
     libraries: tuple[MappedLibrary, ...] = (),
     advisories: tuple[Advisory, ...] | None = None,
+    *,
+    says_counts: bool = False,
 ) -> list[Finding]:
     """Return the runtime findings on this machine, for the variables in ``environment``.
 
     ``insecure_rmws`` maps RMWs that were found not to enforce security to the evidence.
     ``libraries`` are installed DDS libraries, and ``advisories`` are the known vulnerabilities;
-    None means the advisories that ship with sros.
+    None means the advisories that ship with sros.  With ``says_counts``, a line says how many
+    processes run secured and open.
     """
     from sros_tool.checks.processes import security_counts_text
     from sros_tool.checks.runtime import RuntimeState, runtime_findings
@@ -726,7 +730,7 @@ def _machine_findings(
     state = RuntimeState(
         environment, moment, zone, running, rmws, insecure_rmws, clock, libraries, advisories
     )
-    if counts := security_counts_text(running):
+    if says_counts and (counts := security_counts_text(running)):
         echo(counts, err=True)
     return runtime_findings(state)
 
