@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import http.client
 import os
-import ssl
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -20,24 +18,25 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple, TypeVar
-from urllib.parse import quote, urlsplit
 
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from sros_tool.agent.connection import (
-    REFUSALS,
-    GuardedConnection,
-    error_clause,
-    is_tls_ended_by_server,
-)
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
+from sros_tool.agent.inbox import RefusedError, send
 from sros_tool.agent.install import (
     Installation,
     install_release,
     present_lists,
     release_time,
     waits_for_answer,
+)
+from sros_tool.agent.renewals import (
+    Renewals,
+    drop_installed_keys,
+    enclave_key,
+    renewals,
+    waiting_keys,
 )
 from sros_tool.agent.running import (
     EnclaveProcesses,
@@ -69,14 +68,12 @@ from sros_tool.checks.keystores.arrival import (
 )
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.faults import KEY_MADE_ON_ROBOT
-from sros_tool.files import remove_file, replace_file, staged_file
+from sros_tool.files import remove_file, replace_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     FOREIGN_ENCLAVES,
     LONGEST_LIST,
     LONGEST_SEAL,
-    MESSAGE_FILE,
-    MOST_REQUESTS,
     OF_SAME_NUMBER,
     READABLE_KEYS,
     REMOVED_ENCLAVES,
@@ -95,34 +92,31 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.release import Release, sealed_robot
-from sros_tool.keystore.expiry import Threshold, read_credentials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
     GOVERNANCE_FILE,
     IDENTITY_CA_FILE,
     KEY_FILE,
-    KEY_URI_FILE,
     PERMISSIONS_CA_FILE,
     ROUTER_FILE,
     enclave_folder,
     enclave_path,
     search_enclaves,
 )
-from sros_tool.keystore.reader import OpenedKeystore, read_certificate
+from sros_tool.keystore.reader import read_certificate
 from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     key_digest,
     key_digest_of_ca,
     load_certificates,
-    make_request,
     pem,
     validity_of,
 )
 from sros_tool.pki.crl import list_number, newest_list
-from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
-from sros_tool.pki.token import Secrets, open_enclave_key, place_in_file
+from sros_tool.pki.keys import load_key
+from sros_tool.pki.token import Secrets
 from sros_tool.runtime.processes import RunningProcesses, boot_id
 from sros_tool.validity import elapsed, iso, time_of_file
 from sros_tool.wording import capitalized, counted, first_few
@@ -151,10 +145,6 @@ _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 _ServerAnswer = TypeVar("_ServerAnswer")
 _MOST_CERTIFICATES = 8
 """Maximum number of client certificates that the agent tries if a web server refuses them."""
-
-
-class RefusedError(UnavailableError):
-    """The web server refuses a message, perhaps because it refuses the client's certificate."""
 
 
 class Round(NamedTuple):
@@ -290,7 +280,7 @@ class _Round:
             list_replaced=_moments_of(list_due, self._state.list_replaced),
         )
         own = self._own_enclaves(names)
-        asked = _renewals(
+        asked = renewals(
             self._folder,
             own,
             now=now,
@@ -692,7 +682,7 @@ class _Round:
             )
             return Installation()
         names = tuple({*release.enclaves(), *search_enclaves(self._folder)[0]})
-        keys = _waiting_keys(self._folder, names)
+        keys = waiting_keys(self._folder, names)
         replaced = self._revocation_lists(names)
 
         def before(ran: Sequence[str]) -> None:
@@ -733,7 +723,7 @@ class _Round:
         self._save_state()
         self._is_in_step = not installation.kept
         self._drop_replaced_list(names)
-        _drop_installed_keys(self._folder, keys)
+        drop_installed_keys(self._folder, keys)
         return installation
 
     def _time_to_be_valid_at(self, release: Release, certain_time: datetime) -> datetime:
@@ -1054,7 +1044,7 @@ class _Round:
         refused: list[str] = []
         for name, certificate in order:
             try:
-                key = _enclave_key(self._folder, name, self._machine.secrets)
+                key = enclave_key(self._folder, name, self._machine.secrets)
                 if key.public_key() == certificate.public_key():
                     return smime.sign(render_confirmation(confirmation), certificate, key)
             except (SrosError, OSError) as error:
@@ -1166,222 +1156,3 @@ def _error_sentence(error: SrosError) -> str:
     text = str(error)
     begun = text if text.startswith("http") else capitalized(text)
     return begun + ("" if text.endswith(".") else ".")
-
-
-def send(
-    inbox: str,
-    robot: str,
-    message: bytes,
-    *,
-    client_certificate: ClientCertificate | None = None,
-    tls_ca: Path | None = None,
-) -> None:
-    """Put a message into the inbox, in place of the robot's last message.
-
-    Args:
-        inbox: ``https://…``, ``http://…``, or the path of a folder.
-        robot: the name of this robot.
-        message: the signed message.
-        client_certificate: certificate and key for TLS.
-        tls_ca: CA certificates (PEM) of the server; None: the CAs of the system.
-
-    Raises:
-        UnavailableError: the inbox cannot be reached, or does not take the message; `RefusedError`
-        if the inbox seems to refuse the client certificate.
-    """
-    if not inbox.startswith(("https://", "http://")):
-        _write_message(Path(inbox), robot, message)
-        return
-    failure = f"the inbox {inbox} does not accept the message"
-    try:
-        url = urlsplit(inbox)
-        where = f"{url.path.rstrip('/')}/{quote(robot)}/{MESSAGE_FILE}"
-        context = None
-        if url.scheme == "https":
-            context = ssl.create_default_context(cafile=str(tls_ca) if tls_ca else None)
-            if client_certificate:
-                context.load_cert_chain(client_certificate.certificate, client_certificate.key)
-        port = url.port or (443 if context else 80)
-        with GuardedConnection(url.hostname or "", port, context) as connection:
-            headers = {"Content-Type": "application/pkcs7-mime", "User-Agent": "sros"}
-            connection.request("PUT", where, message, headers)
-            reply = connection.getresponse()
-            if connection.is_cut_off:  # the answer may be incomplete
-                raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
-    except (OSError, http.client.HTTPException, ValueError) as error:
-        kind = RefusedError if is_tls_ended_by_server(error) else UnavailableError
-        why = error_clause(error)
-        raise kind(
-            failure,
-            f"{capitalized(why).removesuffix('.')}.",
-            "The agent tries again in its next round.",
-        ) from error
-    if not 200 <= reply.status < 300:
-        kind = RefusedError if reply.status in REFUSALS else UnavailableError
-        raise kind(
-            failure,
-            f"The server answers {reply.status} to PUT {where}.",
-            "See the log of the server.",
-        )
-
-
-def _write_message(inbox: Path, robot: str, message: bytes) -> None:
-    try:
-        with Folder(inbox) as folder:
-            if not folder.is_folder(robot):
-                folder.mkdir(robot, 0o755)
-        file = inbox / robot / MESSAGE_FILE  # the keystore machine's account has to read it
-        with staged_file(file, message, mode=0o644, ignores_umask=True) as put_in_place:
-            put_in_place()
-    except OSError as error:
-        raise UnavailableError(
-            f"the message cannot be written into '{inbox}'",
-            f"{error.strerror or error}.",
-            "The agent tries again in its next round."
-            + (
-                " If a systemd unit runs the agent, the unit was written before `sros agent "
-                "init`, and forbids this: write it again with `sros units KEYSTORE --job agent "
-                "FOLDER`."
-                if error.errno == errno.EROFS
-                else ""
-            ),
-        ) from error
-
-
-_NEW_KEYS_FOLDER = "new-keys"
-
-
-_NEW_KEY_AFTER = 0.6
-"""The elapsed fraction of a validity after which a robot asks for a new key.
-
-`sros renew --all-expiring soon` renews with the present key after two thirds at the earliest, and
-`sros fleet collect` signs requests after half.
-"""
-
-
-def _is_renewal_due(keystore: OpenedKeystore, name: str, now: datetime, *, new_key: bool) -> bool:
-    """Return whether the robot asks for the renewal of an enclave.
-
-    It asks when a third of the time from the arrival of the certificate to its expiry is left. A
-    file is written only when it changes, so its modification time is when the robot got the
-    certificate.  With ``new_key``, the expiry of the permissions counts, too: otherwise, when the
-    permissions are due, the keystore machine would renew the certificate with the present key.
-
-    Raises:
-        SrosError: the certificate cannot be read.
-    """
-    if new_key:
-        with suppress(SrosError):  # what is wrong with permissions is reported elsewhere
-            lifetime = read_credentials(keystore, name).lifetime()
-            return lifetime.is_due(Threshold(elapsed=_NEW_KEY_AFTER), now)
-    file = keystore.folder(name) / CERTIFICATE_FILE
-    validity, here_since = validity_of(read_certificate(file)), time_of_file(file.stat().st_mtime)
-    left = 1 - _NEW_KEY_AFTER if new_key else 1 / 3
-    return now >= validity.not_after - validity.lifetime(here_since) * left
-
-
-def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
-    """Return the private key of an enclave on this robot, from its file or its token.
-
-    Raises:
-        SrosError: the enclave has no key, or the key cannot be used.
-    """
-    place = enclave_path(folder, name)
-    if (place / KEY_FILE).exists():
-        return load_key(read_bytes(place / KEY_FILE, "private key"), f"of enclave {name}")
-    return open_enclave_key(place_in_file(place / KEY_URI_FILE), secrets)
-
-
-class Renewals(NamedTuple):
-    """The signing requests (PEM) for a message, and the enclave whose key has to sign the message.
-
-    Only the current key of an enclave can vouch for its new key, by signing the message.  So a
-    message has at most one request for a new key, which is from the enclave ``signer``.  Every
-    hour, another enclave is the signer.
-    """
-
-    requests: tuple[str, ...]
-    signer: str | None
-    problems: tuple[str, ...]
-    """Sentences on enclaves without a request."""
-
-
-def _renewals(
-    folder: Path, names: Iterable[str], *, now: datetime, new_key: bool, secrets: Secrets
-) -> Renewals:
-    """Return requests for the enclaves ``names`` that are due for renewal.
-
-    With ``new_key``, the requests are for new keys, which wait next to the current keys until their
-    certificates are installed; a key on a token stays.  ``secrets`` is asked for the PIN of a
-    token.
-    """
-    requests: list[str] = []
-    problems: list[str] = []
-    with_new_keys: list[str] = []
-    keystore = OpenedKeystore(folder)
-    for name in names:
-        is_new = new_key and (enclave_path(folder, name) / KEY_FILE).exists()
-        try:
-            is_due = _is_renewal_due(keystore, name, now, new_key=is_new)
-            if not is_due or len(requests) == MOST_REQUESTS - 1:
-                continue
-            if is_new:
-                with_new_keys.append(name)
-                continue
-            requests.append(make_request(_enclave_key(folder, name, secrets), name).decode())
-        except (SrosError, OSError) as error:
-            problems.append(f"{name} cannot be renewed: {error}")
-    signer = None
-    if with_new_keys:
-        signer = with_new_keys[int(now.timestamp()) // 3600 % len(with_new_keys)]
-        try:
-            requests.append(make_request(_waiting_key(folder, signer), signer).decode())
-        except (SrosError, OSError) as error:
-            problems.append(f"{signer} cannot be renewed: {error}")
-    return Renewals(tuple(requests), signer, tuple(problems))
-
-
-def _key_file(name: str) -> str:
-    """Return the path, in the agent's folder, of the new key of an enclave."""
-    return f"{_NEW_KEYS_FOLDER}/{hashlib.sha256(name.encode()).hexdigest()[:32]}.pem"
-
-
-def _waiting_key(folder: Path, name: str) -> PrivateKey:
-    """Return an enclave's new key, which waits for its certificate; make the key if it is missing.
-
-    Raises:
-        SrosError: the key cannot be read.
-        OSError: the key cannot be written.
-    """
-    agents_folder = agent_folder(folder)
-    path = agents_folder / _key_file(name)
-    if os.path.lexists(path):
-        return load_key(read_bytes(path, "private key"), f"of enclave {name}")
-    with Folder(agents_folder) as opened:
-        if not opened.is_folder(_NEW_KEYS_FOLDER):
-            opened.mkdir(_NEW_KEYS_FOLDER, 0o700)
-    key = generate_key()
-    with staged_file(path, key_pem(key)) as put_in_place:
-        put_in_place()
-    return key
-
-
-def _waiting_keys(folder: Path, names: Iterable[str]) -> dict[str, PrivateKey]:
-    """Return the new keys that wait for their certificates, by enclave."""
-    keys = {}
-    for name in names:
-        path = agent_folder(folder) / _key_file(name)
-        if os.path.lexists(path):
-            with suppress(SrosError):
-                keys[name] = load_key(read_bytes(path, "private key"), f"of enclave {name}")
-    return keys
-
-
-def _drop_installed_keys(folder: Path, keys: Mapping[str, PrivateKey]) -> None:
-    """Remove the waiting copies of new keys that were installed."""
-    for name, key in keys.items():
-        with suppress(SrosError, OSError):
-            path = enclave_path(folder, name) / KEY_FILE
-            present = load_key(read_bytes(path, "private key"), f"of enclave {name}")
-            if present.public_key() == key.public_key():
-                remove_file(agent_folder(folder) / _key_file(name))

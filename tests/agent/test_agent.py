@@ -15,8 +15,9 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
-from sros_tool.agent.agent import Machine, RefusedError, Round, run_round
+from sros_tool.agent.agent import Machine, Round, run_round
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem
+from sros_tool.agent.inbox import RefusedError
 from sros_tool.agent.running import Systemd
 from sros_tool.agent.settings import (
     AgentSettings,

@@ -13,7 +13,7 @@ from threading import Event, Thread
 import pytest
 
 from sros_tool.agent import connection
-from sros_tool.agent.agent import send
+from sros_tool.agent.inbox import send
 from sros_tool.errors import KeystoreError, UnavailableError
 
 

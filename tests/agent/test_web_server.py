@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.agent.agent import send
 from sros_tool.agent.fetch import ClientCertificate, fetch_release, pin_root
+from sros_tool.agent.inbox import send
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.keystore.confirmation import MAX_BYTES, MESSAGE_FILE
 from tests.support.harness import policy_text, publish, sros
