@@ -49,6 +49,7 @@ from sros_tool.keystore.delivery.repository import (
     new_key,
     read_present,
 )
+from sros_tool.keystore.delivery.role_keys import RoleKeys
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
@@ -665,7 +666,7 @@ def test_a_killed_rotation_of_a_root_key_elsewhere_recovers(
     safe, spare = (publisher.folder / name for name in ("safe.pem", "safe.pem.new"))
     (publisher.root / "private/fleet_root.pem").rename(safe)
     robot, old = publisher.robot(), safe.read_bytes()
-    owner = publishing._RoleKeys if after == "write_new_key_outside" else publishing._Publication
+    owner = RoleKeys if after == "write_new_key_outside" else publishing._Publication
     done = getattr(owner, after)
 
     def killed(*words: object) -> None:
