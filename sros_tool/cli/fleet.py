@@ -745,7 +745,7 @@ def _status(
         print_json(compared)
         return exit_status
     if prometheus:
-        from sros_tool.keystore.fleet_status import fleet_metrics
+        from sros_tool.keystore.fleet_metrics import fleet_metrics
         from sros_tool.prometheus import render_metrics
 
         text = render_metrics(fleet_metrics(status, now=moment, advisories=known))

@@ -45,11 +45,11 @@ from sros_tool.keystore.confirmation import (
     parse_confirmation,
     problem_rank,
 )
+from sros_tool.keystore.fleet_metrics import fleet_metrics
 from sros_tool.keystore.fleet_status import (
     FleetStatus,
     State,
     _KeystoreRecords,
-    fleet_metrics,
     fleet_status,
 )
 from sros_tool.keystore.layout import ENCLAVES, REFUSED

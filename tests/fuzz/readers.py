@@ -28,7 +28,8 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.describe import describe, history
-from sros_tool.keystore.fleet_status import fleet_metrics, fleet_status
+from sros_tool.keystore.fleet_metrics import fleet_metrics
+from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.authority import check_imported_ca
 from sros_tool.keystore.ledger import certificate_entry
 from sros_tool.keystore.lifecycle.rotation import read_rotation, rotation_status
