@@ -305,9 +305,9 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
             "keystore comes from a backup. Nothing was changed.",
             "Check the files on the server, and publish there again. Only if the keystore comes "
             "from a backup, run `sros fleet collect KEYSTORE INBOX` before you publish: it takes "
-            "the list from the message of this robot. In a CA rotation, also run `sros crl "
-            f"KEYSTORE --refresh --crl FILE` with this robot's {IDENTITY_CA_FILE}, which then has "
-            "revocation lists, too.",
+            "the list from the message of this robot. In a CA rotation, this robot's "
+            f"{IDENTITY_CA_FILE} has revocation lists, too: also run `sros crl KEYSTORE --refresh "
+            "--crl FILE` with this file.",
         )
 
 

@@ -320,7 +320,10 @@ class _LoadedFiles:
 def _loaded_files(
     enclave: ProcessEnclave, newer_files: Sequence[str], process: Process, ledgers: _Ledgers
 ) -> _LoadedFiles:
-    """Return data of the files that a process loaded; for ``newer_files``, from the ledger."""
+    """Return the validities and rights of the files that a process loaded.
+
+    Those of files that were replaced since (``newer_files``) come from the ledger.
+    """
     windows: dict[str, Window] = {}
     changed = {file.split()[0] for file in newer_files}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)

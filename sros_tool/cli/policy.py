@@ -253,17 +253,17 @@ def diff_policy(
 ) -> int:
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
-    "~" marks an enclave that has the same rights under another name, and a name that became
-    absolute or relative (cmd, /cmd), so that only users who put the node into another namespace get
-    other rights. A and B are policies, folders of policies, permissions (.p7s or .xml), folders of
-    enclaves, keystores, exports, or Zenoh configurations such as router.json5. Permissions and
-    Zenoh rules are shown in ROS terms; the signature of permissions is verified if the permissions
-    CA is next to them. "!" marks a right of B whose counterpart, such as the subscriber, only A
-    has. If A or B covers only some enclaves, as an export does, only these are compared. If only
-    one side has Zenoh routers, and these have only the rights that every node needs, they do not
-    count as a difference; a note names them. Lines that differ only in the robot of a fleet are
-    shown as one. Two policies are also compared by the protection that they demand, two keystores
-    by their governance.
+    "~" marks an enclave that has the same rights under another name. It also marks a name that
+    became absolute or relative (cmd, /cmd), which gives other rights only to users who put the node
+    into another namespace. A and B are policies, folders of policies, permissions (.p7s or .xml),
+    folders of enclaves, keystores, exports, or Zenoh configurations such as router.json5.
+    Permissions and Zenoh rules are shown in ROS terms; the signature of permissions is verified if
+    the permissions CA is next to them. "!" marks a right of B whose counterpart, such as the
+    subscriber, only A has. If A or B covers only some enclaves, as an export does, only these are
+    compared. If only one side has Zenoh routers, and these have only the rights that every node
+    needs, they do not count as a difference; a note names them. Lines that differ only in the robot
+    of a fleet are shown as one. Two policies are also compared by the protection that they demand,
+    two keystores by their governance.
 
     The exit status is 1 if A and B differ (notes name differences that are not in the rights),
     or if DDS would refuse A or B.

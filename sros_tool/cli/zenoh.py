@@ -377,7 +377,7 @@ def _configuration_lines(
             for stated in (stated for stated in rights.rights if stated.right == right):
                 domain = "" if stated.domain == "0" else f" (domain {stated.domain})"
                 lacks = (
-                    (f" (without effect, because it lacks {', '.join(stated.lacks)})")
+                    (f" (without effect, because no rule allows {', '.join(stated.lacks)})")
                     if stated.lacks
                     else ""
                 )

@@ -427,9 +427,9 @@ class _RemainingProcesses:
 
 
 def _with_unit_to_change(command: str, unit: str) -> str:
-    """Return the open command of a process, and what to do with its unit, which starts it closed.
+    """Return the command that starts a process open, and what to do with its unit before.
 
-    In a unit of `sros units`, there is no part that can be removed.
+    A unit of `sros units` has to be disabled, because it only starts its process closed.
     """
     if unit.startswith(TEMPLATE.removesuffix(".service")):
         disable = f"systemctl disable --now {shlex.quote(unit)}"

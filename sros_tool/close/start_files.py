@@ -136,7 +136,7 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
     folder, due = robot.folder.absolute(), state.pending_by_hand
     commands = state.observed.commands_by_hand(folder)
     rest = {command: commands[command] for command in commands if command not in due}
-    place = "by its command below, where it is started today."
+    place = "by its command below, in the terminal or script that starts it now."
     together = "# Start them one second apart: processes that start together may miss each other."
     lines = [
         "# Stop all of these processes: secured and open ones do not hear each other. Then",

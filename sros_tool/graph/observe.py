@@ -505,7 +505,8 @@ def _with_enclaves_by_order(
     """Return ``candidates`` with the enclaves that the order of ``listed_nodes`` decides.
 
     The nth listed node of a name belongs to the nth participant with a node of that name, if there
-    are as many nodes as participants. ``candidates`` do not change if the order contradicts them.
+    are as many nodes as participants. ``processes`` maps participants to the names of their nodes.
+    ``candidates`` do not change if the order contradicts them.
     """
     enclaves: dict[_Name, list[str]] = {}
     for enclave, ns, name in listed_nodes:

@@ -67,8 +67,8 @@ GAP = "gap"
 LEDGER_REMEDY = (
     "Restore ledger.jsonl and ledger.p7s from the same backup. Without a backup, state all "
     "rights again with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`, and replace the "
-    "CAs with `sros rotate_ca KEYSTORE --next`, so that files that the ledger lacks are no "
-    "longer valid."
+    "CAs, with `sros rotate_ca KEYSTORE --next` for each stage: after the last stage, files that "
+    "the ledger lacks are no longer valid."
 )
 """What to do about a ledger with missing or changed lines."""
 SEALED = "sealed"
@@ -991,9 +991,10 @@ def _too_large_error(path: Path) -> KeystoreError:
         f"It has more than {_MOST_BYTES // 1024**2} MiB or {_MOST_LINES} lines.",
         f"If it belongs to this keystore, move {LEDGER}, its parts and {LEDGER_HEAD} to an "
         f"archive, and state all rights again with `sros generate_artifacts -k {quote(str(root))} "
-        f"-p POLICY_FILE`. Then replace the CAs with `sros rotate_ca {quote(str(root))} --next`: "
-        "files that the new ledger lacks are then no longer valid. If the ledger does not belong "
-        "to this keystore, restore the right ledger from a backup.",
+        f"-p POLICY_FILE`. Then replace the CAs, with `sros rotate_ca {quote(str(root))} --next` "
+        "for each stage: after the last stage, files that the new ledger lacks are no longer "
+        "valid. If the ledger does not belong to this keystore, restore the right ledger from a "
+        "backup.",
     )
 
 

@@ -498,7 +498,7 @@ def is_whole_policy(content: bytes) -> bool:
 def files_used_whole(
     policies: Iterable[str], content: Callable[[str], bytes | None]
 ) -> dict[str, bool]:
-    """Map each file that is used as a whole to whether its root element is used, too.
+    """Map each file of which all content is used to whether its root element is used, too.
 
     Args:
         policies: the paths of the policies.

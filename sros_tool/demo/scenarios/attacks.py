@@ -810,7 +810,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Identity(Undefended(forger.another_permissions_ca_trusted), "guest"),
             RowStatus.HEARD,
             "the listener trusts this CA, so it accepts the permissions",
-            defence_removed="a listener that trusts only the keystore's permissions CA",
+            defence_removed="the listener's refusal of other permissions CAs",
         ),
     ),
     *tries(

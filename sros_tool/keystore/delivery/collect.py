@@ -280,7 +280,7 @@ def collect(
             OpenedKeystore(root),
             taken,
             is_restored=bool(signed),
-            is_older=bool(forgotten.later_number),
+            shows_later_releases=bool(forgotten.later_number),
         )
         if not not_signed:
             not_signed, more_notes, more_signed = _sign(
@@ -1078,21 +1078,22 @@ def _defer_requests(
     messages: Sequence[_ReceivedMessage],
     *,
     is_restored: bool,
-    is_older: bool,
+    shows_later_releases: bool,
 ) -> None:
     """Refuse requests with new keys while something shows that the keystore was restored.
 
     The key that vouches for a new key may have been revoked after the backup.  If the keystore must
     not publish before ``--restored``, all requests are refused, because a new certificate comes
     with the rights of the backup.  ``is_restored`` says that messages of
-    this run show lost revocations; ``is_older``, that they show later releases.
+    this run show lost revocations; ``shows_later_releases``, that they show releases that
+    the keystore does not know.
     """
     requests = [request for message in messages for request in message.requests if request.request]
     if not requests:
         return
     from sros_tool.keystore.delivery.publish import age_clause
 
-    if is_older := is_older or has_unpublished_restore(keystore):
+    if has_lost_releases := shows_later_releases or has_unpublished_restore(keystore):
         reason = "rights that were taken away after the backup would come back"
     elif is_restored or age_clause(keystore):
         reason = "the key that vouches for the new key may be revoked"
@@ -1103,7 +1104,7 @@ def _defer_requests(
         f"{_restored_command(keystore)}"
     )
     for request in requests:
-        if is_older or request.is_new_key:
+        if has_lost_releases or request.is_new_key:
             request.set_outcome("refused", why)
 
 
