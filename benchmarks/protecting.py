@@ -36,12 +36,7 @@ from sros_tool.parallel import end_with_starter
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.runtime.environment import secured_environment
-from sros_tool.runtime.netns import (
-    Progress,
-    RowNetwork,
-    run_isolated,
-    try_isolation,
-)
+from sros_tool.runtime.netns import Progress, RowNetwork, run_isolated, try_isolation
 from sros_tool.runtime.variables import DOMAIN
 
 _UNSECURED = "unsecured"

@@ -98,19 +98,12 @@ def loadable_environment(
     """
     from sros_tool.distributions import unknown_distribution_notes
     from sros_tool.keystore.known_keys import other_enclave
-    from sros_tool.keystore.layout import (
-        KEY_FILE,
-        enclave_path,
-    )
+    from sros_tool.keystore.layout import KEY_FILE, enclave_path
     from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.selection import missing_enclave_error
     from sros_tool.names import check_enclave_name
     from sros_tool.pki.token import MODULE_VARIABLE, pin_notes
-    from sros_tool.runtime.environment import (
-        REFUSING_ZENOH,
-        RMW_ZENOH,
-        secured_environment,
-    )
+    from sros_tool.runtime.environment import REFUSING_ZENOH, RMW_ZENOH, secured_environment
     from sros_tool.runtime.rmw import (
         RMW,
         chosen_rmw,

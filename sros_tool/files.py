@@ -14,13 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from sros_tool.errors import DocumentError
-from sros_tool.folders import (
-    Folder,
-    make_folders,
-    make_temporary_folder,
-    remove_folders,
-    write_all,
-)
+from sros_tool.folders import Folder, make_folders, make_temporary_folder, remove_folders, write_all
 from sros_tool.terminal import log_step
 from sros_tool.wording import capitalized
 

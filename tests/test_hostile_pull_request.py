@@ -16,15 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.code_host import (
-    POLICY,
-    REQUIRED,
-    Job,
-    Origin,
-    action_job,
-    gitlab_job,
-    policy,
-)
+from tests.support.code_host import POLICY, REQUIRED, Job, Origin, action_job, gitlab_job, policy
 from tests.support.harness import publish
 from tests.support.long_form import some
 

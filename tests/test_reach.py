@@ -12,14 +12,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, Rules
-from sros_tool.reach import (
-    OF_EVERY_NODE,
-    QUESTIONS,
-    DomainRights,
-    Network,
-    Unguarded,
-    path_text,
-)
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, DomainRights, Network, Unguarded, path_text
 
 
 def rights(*lines: str) -> list[Right]:

@@ -20,13 +20,7 @@ from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles, Qua
 from sros_tool.policy.model import DENY as DENY_
 from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.rights import (
-    NodeName,
-    Right,
-    Rules,
-    nodes_not_shown,
-    nodes_of_rights,
-)
+from sros_tool.policy.rights import NodeName, Right, Rules, nodes_not_shown, nodes_of_rights
 from sros_tool.translate import permissions_for
 from sros_tool.translate_zenoh.graph import (
     announced_nodes,

@@ -24,12 +24,7 @@ from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import EXPIRED_METADATA, OLDER_THAN_SEEN
 from sros_tool.keystore.delivery.archive import LIMITS_OF_ONE_ROBOT
-from sros_tool.keystore.delivery.release import (
-    Release,
-    check_tuf,
-    read_release,
-    release_target,
-)
+from sros_tool.keystore.delivery.release import Release, check_tuf, read_release, release_target
 from sros_tool.validity import iso
 from sros_tool.wording import capitalized
 from sros_tool.xml import read_bytes

@@ -28,11 +28,7 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import KEY_NOT_HERE, OF_OTHER_CA, OLDER_THAN_INSTALLED
-from sros_tool.keystore.delivery.release import (
-    RELEASE_FILES,
-    Release,
-    seal_problem,
-)
+from sros_tool.keystore.delivery.release import RELEASE_FILES, Release, seal_problem
 from sros_tool.keystore.delivery.robot import evaluate_delivered_files
 from sros_tool.keystore.delivery.rollback import older_list, retired_authorities
 from sros_tool.keystore.layout import (

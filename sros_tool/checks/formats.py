@@ -17,12 +17,7 @@ from urllib.parse import quote
 
 from sros_tool.checks.kind import ChosenFindings, Finding, FindingKind, Severity, group_by_cause
 from sros_tool.errors import SrosError
-from sros_tool.fleet.robots import (
-    Fleet,
-    grouped_by_robot,
-    named_robots,
-    with_robot_placeholder,
-)
+from sros_tool.fleet.robots import Fleet, grouped_by_robot, named_robots, with_robot_placeholder
 from sros_tool.keystore.layout import (
     CRL_FILE,
     GOVERNANCE_P7S,

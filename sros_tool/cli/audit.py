@@ -137,11 +137,7 @@ def audit(
     something was not judged (unless --unjudged is given), and if the graph kept changing (unless
     --unsettled is given); 2 if the audit could not be done.
     """
-    from sros_tool.distributions import (
-        ROS_DISTRO,
-        sourced_distribution,
-        unknown_distribution_notes,
-    )
+    from sros_tool.distributions import ROS_DISTRO, sourced_distribution, unknown_distribution_notes
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.participant import JoinContext

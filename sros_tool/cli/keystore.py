@@ -413,11 +413,7 @@ def list_enclaves(
       /listener
       /talker
     """
-    from sros_tool.keystore.layout import (
-        check_keystore,
-        enclave_names,
-        hidden_enclaves,
-    )
+    from sros_tool.keystore.layout import check_keystore, enclave_names, hidden_enclaves
 
     check_keystore(root)
     if patterns or robots:

@@ -31,12 +31,7 @@ from sros_tool.wording import counted
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.proof.repository import Repository
-    from sros_tool.proof.review import (
-        AccessChange,
-        Review,
-        ReviewRequest,
-        ReviewStep,
-    )
+    from sros_tool.proof.review import AccessChange, Review, ReviewRequest, ReviewStep
 
     _PathsType = click.ParamType[tuple[str, ...]]
 else:  # generic from click 8.2 on
@@ -439,12 +434,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
     from sros_tool.checks.kind import ChosenFindings
     from sros_tool.cli.policy import access_summary
     from sros_tool.keystore.expiry import ExpiryCheck
-    from sros_tool.proof.review import (
-        AccessChange,
-        DroppedRequirements,
-        RightsChange,
-        StepFindings,
-    )
+    from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange, StepFindings
 
     place = f" {result.place}" if result.place and step.kind.startswith("requirements") else ""
     match step.content:
@@ -518,13 +508,7 @@ def _findings(result: Review, request: ReviewRequest) -> list[Finding]:
 def _step_findings(result: Review, step: ReviewStep, request: ReviewRequest) -> Iterator[Finding]:
     """Yield the findings of a step, each at a place in HEAD."""
     from sros_tool.checks.kind import ChosenFindings
-    from sros_tool.checks.review import (
-        EXPIRY,
-        NEW_ACCESS,
-        NOT_REVIEWED,
-        PRIVATE_KEY,
-        UNDECIDED,
-    )
+    from sros_tool.checks.review import EXPIRY, NEW_ACCESS, NOT_REVIEWED, PRIVATE_KEY, UNDECIDED
     from sros_tool.keystore.expiry import ExpiryCheck, describe_lifetime
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange, StepFindings
 
@@ -709,12 +693,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     from sros_tool.cli.policy import access_markdown, rights_markdown
     from sros_tool.keystore.expiry import ExpiryCheck, describe_lifetime
     from sros_tool.markdown import bounded_list, code
-    from sros_tool.proof.review import (
-        AccessChange,
-        DroppedRequirements,
-        RightsChange,
-        StepFindings,
-    )
+    from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange, StepFindings
 
     def findings(chosen_findings: ChosenFindings, title: str = "Findings") -> str:
         shown = tuple(map(result.shown_finding, chosen_findings.shown))

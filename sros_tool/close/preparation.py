@@ -20,12 +20,7 @@ from sros_tool.checks.processes import has_other_files, other_folder_findings
 from sros_tool.checks.requirements import VACUOUS, VIOLATED
 from sros_tool.close.acceptance import Acceptance, Acceptances
 from sros_tool.close.nodes import ObservedNodes
-from sros_tool.close.processes import (
-    ClosedProcess,
-    ObservedProcesses,
-    process_text,
-    run_words,
-)
+from sros_tool.close.processes import ClosedProcess, ObservedProcesses, process_text, run_words
 from sros_tool.close.rights import names_without_requirement
 from sros_tool.close.robot import MOST_NAMES, TEMPLATE, LocalRobot
 from sros_tool.close.start_files import write_start_files
@@ -58,10 +53,7 @@ from sros_tool.policy.rights import Rules, policy_rights
 from sros_tool.proof.requirements import RightsRequirement, read_requirements
 from sros_tool.runtime.environment import RMW_ZENOH, node_argument, remapping_rules
 from sros_tool.runtime.processes import SEVERAL_USERS, without_launch_files
-from sros_tool.runtime.rmw import (
-    RMW,
-    no_security_text,
-)
+from sros_tool.runtime.rmw import RMW, no_security_text
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.values import FileChange
 from sros_tool.wording import counted, enumerated, first_few

@@ -14,13 +14,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 from sros_tool.enclave_environment import RMWS
 from sros_tool.errors import DocumentError
 from sros_tool.policy.model import Policy
-from sros_tool.runtime.environment import (
-    REFUSING,
-    REFUSING_DDS,
-    RMW_ZENOH,
-    ROS_ARGS,
-    named_enclave,
-)
+from sros_tool.runtime.environment import REFUSING, REFUSING_DDS, RMW_ZENOH, ROS_ARGS, named_enclave
 from sros_tool.runtime.processes import (
     SERVICE_NAME,
     Process,

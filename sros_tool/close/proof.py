@@ -30,10 +30,7 @@ from sros_tool.checks.processes import (
     process_findings,
 )
 from sros_tool.checks.requirements import MISSPELLED_ENCLAVE, VACUOUS
-from sros_tool.close.nodes import (
-    ObservedNodes,
-    nodes_text,
-)
+from sros_tool.close.nodes import ObservedNodes, nodes_text
 from sros_tool.close.overrides import overrides
 from sros_tool.close.processes import ObservedProcesses, is_in_domain
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
@@ -55,9 +52,7 @@ from sros_tool.close.state import (
 )
 from sros_tool.close.talk import UnitRestarts, proof_of_talk
 from sros_tool.errors import SrosError, UnavailableError
-from sros_tool.graph.observation import (
-    Observation,
-)
+from sros_tool.graph.observation import Observation
 from sros_tool.keystore.expiry import renewal_command, survey
 from sros_tool.keystore.layout import KEY_FILES, enclave_path, list_enclaves
 from sros_tool.keystore.reader import OpenedKeystore

@@ -35,12 +35,7 @@ from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot, check_enclav
 from sros_tool.errors import SrosError
 from sros_tool.keystore.expiry import Threshold, survey
 from sros_tool.keystore.known_keys import IssuedCredentials
-from sros_tool.keystore.layout import (
-    CRL_FILE,
-    KEY_FILE,
-    enclave_path,
-    list_enclaves,
-)
+from sros_tool.keystore.layout import CRL_FILE, KEY_FILE, enclave_path, list_enclaves
 from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore, open_enclave
 from sros_tool.names import expand
 from sros_tool.policy.model import Policy

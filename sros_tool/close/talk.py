@@ -17,11 +17,7 @@ from sros_tool.close.nodes import (
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.rights import ordinary_uses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
-from sros_tool.close.state import (
-    TALK,
-    Proof,
-    RunningRobot,
-)
+from sros_tool.close.state import TALK, Proof, RunningRobot
 from sros_tool.errors import UnavailableError
 from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph.learn import robot_nodes, tool_nodes

@@ -41,12 +41,7 @@ from sros_tool.runtime.rmw import (
     rmw_implementations,
     vendor_of,
 )
-from sros_tool.runtime.stacks import (
-    ProbeEnclave,
-    Stack,
-    cyclone_stack,
-    rclpy_stacks,
-)
+from sros_tool.runtime.stacks import ProbeEnclave, Stack, cyclone_stack, rclpy_stacks
 from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, choose_loadable, domain_of
 from sros_tool.translate import governance_for
 from sros_tool.wording import counted

@@ -15,13 +15,7 @@ from pathlib import Path
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.demo.casting import CastMember, UserKeystore, enclave_grant, node_names
-from sros_tool.demo.forger import (
-    Forge,
-    KeystoreCopy,
-    UncastError,
-    Undefended,
-    folder_name_of,
-)
+from sros_tool.demo.forger import Forge, KeystoreCopy, UncastError, Undefended, folder_name_of
 from sros_tool.demo.scenarios.model import (
     DENIED_TOPIC,
     FOREIGN,

@@ -16,11 +16,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError
 from sros_tool.explain.answer import Evaluator, Question, ask, question_about_action
-from sros_tool.keystore.layout import (
-    CERTIFICATE_FILE,
-    PERMISSIONS_FILE,
-    is_keystore,
-)
+from sros_tool.keystore.layout import CERTIFICATE_FILE, PERMISSIONS_FILE, is_keystore
 from sros_tool.keystore.participant import (
     JoinContext,
     LoadedEnclave,

@@ -48,11 +48,7 @@ from sros_tool.keystore.layout import (
     remedy_in_closed_robot,
 )
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
-from sros_tool.names import (
-    NODE_SERVICES,
-    is_expression,
-    nodes_served,
-)
+from sros_tool.names import NODE_SERVICES, is_expression, nodes_served
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import Right, action_right, order, profile_rights
 from sros_tool.spelling import is_spelled_alike

@@ -25,11 +25,7 @@ from sros_tool.keystore.layout import (
     remedy_in_keystore,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.rights import (
-    RightsSource,
-    notes_on_hidden_enclaves,
-    rights_by_domains,
-)
+from sros_tool.keystore.rights import RightsSource, notes_on_hidden_enclaves, rights_by_domains
 from sros_tool.keystore.selection import likely_names, missing_enclave_error
 from sros_tool.names import is_expression
 from sros_tool.pki.certificates import load_certificate, subject_text

@@ -14,11 +14,7 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.layout import (
-    CERTIFICATE_FILE,
-    enclaves_of_closed_robot,
-    remedy_in_keystore,
-)
+from sros_tool.keystore.layout import CERTIFICATE_FILE, enclaves_of_closed_robot, remedy_in_keystore
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices

@@ -47,12 +47,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.loading import CRASHES, vendor_problems
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, Problem, open_enclave
 from sros_tool.names import ROS_DISCOVERY_TOPIC
-from sros_tool.pki.certificates import (
-    extension,
-    load_certificates,
-    subject_text,
-    validity_of,
-)
+from sros_tool.pki.certificates import extension, load_certificates, subject_text, validity_of
 from sros_tool.policy.model import Enclave
 
 # ── enclaves as DDS loads them ─────────────────────────────────────────────────────────────

@@ -49,11 +49,7 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import files_of_policies, read_policy
-from sros_tool.policy.model import (
-    Policy,
-    StatedProtection,
-    stated_protections,
-)
+from sros_tool.policy.model import Policy, StatedProtection, stated_protections
 from sros_tool.policy.namespaces import ChangedForm, changed_forms
 from sros_tool.policy.node_basics import are_basic
 from sros_tool.policy.patterns import matches

@@ -28,13 +28,7 @@ from sros_tool.names import (
 from sros_tool.pki.token import refuse_pin
 from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.policy.patterns import covers, matches
-from sros_tool.validity import (
-    Span,
-    duration_text,
-    parse_duration,
-    parse_span,
-    span_text,
-)
+from sros_tool.validity import Span, duration_text, parse_duration, parse_span, span_text
 from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:

@@ -42,13 +42,7 @@ from pathlib import Path
 from typing import NamedTuple, Self, TypeVar, overload
 
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.folders import (
-    Folder,
-    make_folders,
-    make_temporary_folder,
-    remove_folders,
-    try_lock,
-)
+from sros_tool.folders import Folder, make_folders, make_temporary_folder, remove_folders, try_lock
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,

@@ -18,12 +18,7 @@ from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519, padding, rsa
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
-from cryptography.x509.oid import (
-    ExtendedKeyUsageOID,
-    ExtensionOID,
-    NameOID,
-    SignatureAlgorithmOID,
-)
+from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID, NameOID, SignatureAlgorithmOID
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant

@@ -20,13 +20,7 @@ from shlex import quote
 from typing import NamedTuple
 
 from sros_tool.errors import Note, UsageError
-from sros_tool.names import (
-    ACTION_PARTS,
-    check_namespace,
-    expand,
-    expression_problem,
-    is_expression,
-)
+from sros_tool.names import ACTION_PARTS, check_namespace, expand, expression_problem, is_expression
 from sros_tool.policy.model import ALLOW, DENY, PEER_RIGHT, Group, Policy, Profile, Qualifier
 from sros_tool.policy.patterns import Names, literal_prefix, matches, renamed_matches
 from sros_tool.policy.rights import (

@@ -28,12 +28,7 @@ from sros_tool.dds.decision.vendors import joined_titles
 from sros_tool.errors import UsageError
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
-from sros_tool.names import (
-    action_part,
-    expand,
-    is_expression,
-    service_of,
-)
+from sros_tool.names import action_part, expand, is_expression, service_of
 from sros_tool.policy.model import ALLOW, DENY, Level, Source
 from sros_tool.policy.patterns import covers, matches
 from sros_tool.policy.remapping import Remapping, has_new_name, remapped_name

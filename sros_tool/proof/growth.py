@@ -37,17 +37,8 @@ from sros_tool.dds.permissions import Grant, Permissions, Rule
 from sros_tool.errors import DocumentError, Note
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.comparison import Effect, SettingChange
-from sros_tool.keystore.rights import (
-    SourceKind,
-    compared_enclaves,
-    rights_grouped_by_domains,
-)
-from sros_tool.names import (
-    ROS_DISCOVERY_TOPIC,
-    is_expression,
-    node_of_service,
-    service_of,
-)
+from sros_tool.keystore.rights import SourceKind, compared_enclaves, rights_grouped_by_domains
+from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression, node_of_service, service_of
 from sros_tool.policy.model import ALLOW, DENY, Profile, Qualifier, Source
 from sros_tool.policy.namespaces import ChangedForm, changed_forms, undenied_name
 from sros_tool.policy.patterns import literal_prefix
@@ -74,13 +65,7 @@ from sros_tool.proof.protection import (
     strict_protection,
 )
 from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource
-from sros_tool.proof.worlds import (
-    ROS_TOPICS,
-    any_allows,
-    domains_of,
-    enforced_access,
-    valid_topics,
-)
+from sros_tool.proof.worlds import ROS_TOPICS, any_allows, domains_of, enforced_access, valid_topics
 from sros_tool.proof.zenoh_settings import unknown_settings
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded_topics
 from sros_tool.translate import governance_for, grant_rights

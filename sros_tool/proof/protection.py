@@ -22,12 +22,7 @@ from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
-from sros_tool.keystore.comparison import (
-    Effect,
-    SettingChange,
-    attribute_changes,
-    compare_settings,
-)
+from sros_tool.keystore.comparison import Effect, SettingChange, attribute_changes, compare_settings
 from sros_tool.keystore.fleet import with_routers_of_robots
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.model import ALLOW, DomainProtection, Level, StatedProtection

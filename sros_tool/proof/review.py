@@ -29,12 +29,7 @@ from sros_tool.checks.keystores.issued import (
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter, FindingKind
 from sros_tool.checks.policies import is_mended_by
-from sros_tool.checks.requirements import (
-    ALLOWED_BY_NAME,
-    HOLDS_ALONE,
-    VACUOUS,
-    VIOLATED,
-)
+from sros_tool.checks.requirements import ALLOWED_BY_NAME, HOLDS_ALONE, VACUOUS, VIOLATED
 from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault

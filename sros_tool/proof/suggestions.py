@@ -12,12 +12,7 @@ from typing import NamedTuple
 
 from sros_tool.automata import SearchLimit
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.names import (
-    expression_problem,
-    is_expression,
-    moves_robot,
-    only_reads,
-)
+from sros_tool.names import expression_problem, is_expression, moves_robot, only_reads
 from sros_tool.policy.model import PEER_RIGHT, RIGHTS, Level, Source
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.placeholders import Placeholder

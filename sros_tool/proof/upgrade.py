@@ -43,21 +43,12 @@ from sros_tool.dds.advisories import Advisory, known_vulnerabilities
 from sros_tool.dds.decision.access import Access, Outcome
 from sros_tool.dds.decision.grants import other_fitting_enclaves
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.distributions import (
-    Distribution,
-    Shipped,
-    find_distribution,
-)
+from sros_tool.distributions import Distribution, Shipped, find_distribution
 from sros_tool.errors import UsageError
 from sros_tool.faults import FAULTS
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.keystore.fleet import enclaves_of_several_distributions, stated_distributions
-from sros_tool.keystore.layout import (
-    PERMISSIONS_FILE,
-    enclave_names,
-    has_zenoh_files,
-    is_keystore,
-)
+from sros_tool.keystore.layout import PERMISSIONS_FILE, enclave_names, has_zenoh_files, is_keystore
 from sros_tool.keystore.participant import (
     JoinContext,
     LoadedEnclave,

@@ -30,11 +30,7 @@ from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import PUBLIC, ROUTER_FILE, is_keystore
 from sros_tool.keystore.participant import evaluate_enclave
 from sros_tool.keystore.protection import governance_with_stated_protections
-from sros_tool.keystore.reader import (
-    OpenedEnclave,
-    OpenedKeystore,
-    open_enclave,
-)
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.keystore.rights import (
     RightsSource,
     is_zenoh,
@@ -43,24 +39,13 @@ from sros_tool.keystore.rights import (
     rights_by_domains,
 )
 from sros_tool.keystore.template import load_template
-from sros_tool.pki.certificates import (
-    authority_text,
-    load_certificates,
-    subject_text,
-    validity_of,
-)
+from sros_tool.pki.certificates import authority_text, load_certificates, subject_text, validity_of
 from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import enclaves_of_nodes, moved_to_enclaves
 from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import RightsDifference, policy_rights
-from sros_tool.report.compose import (
-    PictureSource,
-    compose,
-    overlay,
-    union,
-    with_requirements,
-)
+from sros_tool.report.compose import PictureSource, compose, overlay, union, with_requirements
 from sros_tool.report.focus import focused_picture
 from sros_tool.report.folding import Folding, name_order, units_of
 from sros_tool.report.formats import render_mermaid
@@ -404,12 +389,7 @@ def _with_requirements(
         SrosError: the requirements cannot be read.
     """
     from sros_tool.checks.keystores.opened import Circumstances
-    from sros_tool.proof.findings import (
-        assumption_text,
-        decide_all,
-        decided_findings,
-        short_text,
-    )
+    from sros_tool.proof.findings import assumption_text, decide_all, decided_findings, short_text
     from sros_tool.proof.requirements import Must, demand, read_requirements
     from sros_tool.proof.system import load_system
 

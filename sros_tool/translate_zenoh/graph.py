@@ -22,13 +22,7 @@ from typing import NamedTuple
 from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import Names, TooManyNames, covers, listed_expressions, overlap
-from sros_tool.policy.rights import (
-    CHANGING_NODES,
-    NodeName,
-    Right,
-    denied_nodes,
-    nodes_of_rights,
-)
+from sros_tool.policy.rights import CHANGING_NODES, NodeName, Right, denied_nodes, nodes_of_rights
 from sros_tool.wording import first_few
 from sros_tool.zenoh.access import AccessRule, AclRule, Flow, Message
 from sros_tool.zenoh.key_expressions import (

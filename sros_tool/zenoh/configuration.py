@@ -22,14 +22,7 @@ from json.encoder import encode_basestring_ascii
 from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError, UsageError
-from sros_tool.zenoh.access import (
-    AccessControl,
-    AccessRule,
-    Flow,
-    Message,
-    RemoteRights,
-    rule_ids,
-)
+from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, RemoteRights, rule_ids
 
 
 class Mode(StrEnum):

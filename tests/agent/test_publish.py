@@ -30,11 +30,7 @@ from sros_tool.keystore.delivery.archive import stated_size
 from sros_tool.keystore.delivery.export import ReleasedEnclave
 from sros_tool.keystore.delivery.export import released_enclave as evaluate
 from sros_tool.keystore.delivery.publish import PublishedFleet, publish
-from sros_tool.keystore.delivery.published import (
-    MetadataExpiry,
-    PublishedRelease,
-    read_published,
-)
+from sros_tool.keystore.delivery.published import MetadataExpiry, PublishedRelease, read_published
 from sros_tool.keystore.delivery.release import (
     Release,
     pack_release,

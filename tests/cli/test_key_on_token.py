@@ -16,12 +16,7 @@ from sros_tool.errors import PkiError, UsageError
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.participant import load_enclave
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.pki.token import (
-    TokenUri,
-    parse_enclave_uri,
-    parse_token_file,
-    token_file_content,
-)
+from sros_tool.pki.token import TokenUri, parse_enclave_uri, parse_token_file, token_file_content
 from tests.support.harness import Ended, copy_of, forked, sros
 
 PIN = "98765432"

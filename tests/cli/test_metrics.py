@@ -12,12 +12,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from sros_tool.pki.certificates import validity_of
-from sros_tool.runtime.processes import (
-    Process,
-    ProcessTable,
-    RunningProcesses,
-    UnseenProcess,
-)
+from sros_tool.runtime.processes import Process, ProcessTable, RunningProcesses, UnseenProcess
 from tests.support.harness import certificate, policy_text, publish, sros
 
 KINDS = {"certificate", "permissions", "governance", "identity_ca", "permissions_ca"}

@@ -11,14 +11,7 @@ import pytest
 
 from sros_tool.files import templates_dir
 from sros_tool.proof import findings
-from tests.support.harness import (
-    copy_of,
-    policy_text,
-    publish,
-    sros,
-    subscribe,
-    with_includes,
-)
+from tests.support.harness import copy_of, policy_text, publish, sros, subscribe, with_includes
 
 LISTEN = '<topics subscribe="ALLOW"><topic>{}</topic></topics>'
 WILD = publish("/cmd_*")

@@ -14,11 +14,7 @@ import pytest
 from sros_tool.close import proof
 from sros_tool.close.acceptance import Acceptance
 from sros_tool.close.nodes import MovedEndpoint
-from sros_tool.close.proof import (
-    _proof_of_connections,
-    _proof_of_requirements,
-    _proof_of_silence,
-)
+from sros_tool.close.proof import _proof_of_connections, _proof_of_requirements, _proof_of_silence
 from sros_tool.close.robot import Shell
 from sros_tool.close.talk import (
     _abandoned_names,

@@ -20,13 +20,7 @@ from unittest.mock import MagicMock, Mock
 import pytest
 
 from sros_tool.demo import backend, ros_node
-from sros_tool.demo.backend import (
-    HandNode,
-    backend_by_hand,
-    end_within,
-    run_by_hand,
-    security_line,
-)
+from sros_tool.demo.backend import HandNode, backend_by_hand, end_within, run_by_hand, security_line
 from sros_tool.demo.cyclone_node import CycloneNode
 from sros_tool.demo.nodes import ROLES, NodeOptions
 from sros_tool.demo.scenarios.model import Role

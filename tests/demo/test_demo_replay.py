@@ -6,12 +6,7 @@ import struct
 
 import pytest
 
-from sros_tool.demo.wire import (
-    PacketCounter,
-    packets_of,
-    with_changed_bit,
-    without_checksum,
-)
+from sros_tool.demo.wire import PacketCounter, packets_of, with_changed_bit, without_checksum
 from tests.demo.test_demo_capture import packet
 
 WORDS = "Hello World from the talker"

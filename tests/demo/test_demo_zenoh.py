@@ -13,12 +13,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.demo import backend, program
-from sros_tool.demo.result import (
-    PartyRecord,
-    RowRecord,
-    RowResult,
-    judge_row,
-)
+from sros_tool.demo.result import PartyRecord, RowRecord, RowResult, judge_row
 from sros_tool.demo.scenarios import choose_scenarios
 from sros_tool.demo.scenarios.model import (
     Relation,

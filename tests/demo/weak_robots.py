@@ -10,12 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sros_tool.dds.governance import (
-    Governance,
-    ProtectionKind,
-    parse_governance,
-    render_governance,
-)
+from sros_tool.dds.governance import Governance, ProtectionKind, parse_governance, render_governance
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.demo import forger
 from sros_tool.demo.backend import Backend

@@ -13,13 +13,7 @@ from hypothesis import strategies as st
 from sros_tool.errors import PolicyError, SrosError
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.fleet_file import parse_fleet, render_fleet
-from sros_tool.fleet.robots import (
-    Fleet,
-    Robot,
-    enclaves_of,
-    name_problem,
-    robot_of,
-)
+from sros_tool.fleet.robots import Fleet, Robot, enclaves_of, name_problem, robot_of
 from sros_tool.names import is_expression, namespace_problem
 from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.model import Policy

@@ -46,12 +46,7 @@ from sros_tool.keystore.confirmation import (
     problem_rank,
 )
 from sros_tool.keystore.fleet_metrics import fleet_metrics
-from sros_tool.keystore.fleet_status import (
-    FleetStatus,
-    State,
-    _KeystoreRecords,
-    fleet_status,
-)
+from sros_tool.keystore.fleet_status import FleetStatus, State, _KeystoreRecords, fleet_status
 from sros_tool.keystore.layout import ENCLAVES, REFUSED
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.keystore.template import Template

@@ -13,11 +13,7 @@ from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
-from sros_tool.keystore.lifecycle.rotation import (
-    RotationStage,
-    read_rotation,
-    rotation_status,
-)
+from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation, rotation_status
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server

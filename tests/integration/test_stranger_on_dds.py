@@ -13,14 +13,7 @@ from typing import Any
 import pytest
 
 from tests.integration.fastdds import build
-from tests.integration.trust.trusts import (
-    IDENTITY_FILE,
-    ISSUER,
-    LEAF,
-    SIGNING_CA,
-    Trust,
-    own,
-)
+from tests.integration.trust.trusts import IDENTITY_FILE, ISSUER, LEAF, SIGNING_CA, Trust, own
 from tests.support.children import apart, run, wait_for
 from tests.support.raw_pki import name
 

@@ -30,13 +30,7 @@ from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.update import update_keystore
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
-from sros_tool.pki.certificates import (
-    common_name,
-    issue_ca,
-    make_request,
-    pem,
-    validity_of,
-)
+from sros_tool.pki.certificates import common_name, issue_ca, make_request, pem, validity_of
 from sros_tool.pki.crl import RevocationEntry, sign_crl
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.validity import Window, parse_iso

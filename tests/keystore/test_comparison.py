@@ -10,12 +10,7 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule, attributes
-from sros_tool.keystore.comparison import (
-    Effect,
-    compare_governance,
-    compare_settings,
-    mismatch,
-)
+from sros_tool.keystore.comparison import Effect, compare_governance, compare_settings, mismatch
 from sros_tool.keystore.template import (
     NamedValues,
     ShortLivedEnclaves,

@@ -22,12 +22,7 @@ from sros_tool.keystore.template import (
     render_template,
     template_names,
 )
-from sros_tool.policy.model import (
-    DomainProtection,
-    Level,
-    NamedProtection,
-    TopicProtection,
-)
+from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
 
 texts = st.text(st.characters(codec="utf-8"), max_size=20)
 printable = st.text(st.characters(codec="utf-8"), min_size=1, max_size=40).filter(str.isprintable)

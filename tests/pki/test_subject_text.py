@@ -12,13 +12,7 @@ from cryptography.x509.name import _ASN1Type
 from cryptography.x509.oid import NameOID
 
 from sros_tool.errors import PkiError
-from sros_tool.pki.certificates import (
-    issue_ca,
-    load_certificate,
-    parse_subject,
-    pem,
-    subject_text,
-)
+from sros_tool.pki.certificates import issue_ca, load_certificate, parse_subject, pem, subject_text
 from sros_tool.pki.distinguished_names import short_names
 from sros_tool.pki.keys import generate_key
 from sros_tool.validity import Window, parse_iso

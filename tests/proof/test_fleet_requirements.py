@@ -11,11 +11,7 @@ from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.errors import DocumentError
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.proof.findings import decide_all
-from sros_tool.proof.requirements import (
-    Requirement,
-    demand,
-    parse_requirements,
-)
+from sros_tool.proof.requirements import Requirement, demand, parse_requirements
 from sros_tool.proof.suggestions import render_requirements, suggest
 from sros_tool.proof.system import load_system
 from tests.proof.test_review import Change

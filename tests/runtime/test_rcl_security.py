@@ -8,11 +8,7 @@ import pytest
 
 from sros_tool.errors import SrosError
 from sros_tool.runtime.cyclone import ENCLAVE_FILES
-from sros_tool.runtime.variables import (
-    choose_enclave,
-    choose_loadable,
-    domain_of,
-)
+from sros_tool.runtime.variables import choose_enclave, choose_loadable, domain_of
 
 
 @pytest.fixture

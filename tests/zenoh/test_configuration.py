@@ -8,20 +8,8 @@ from itertools import product
 
 import pytest
 
-from sros_tool.zenoh.access import (
-    AccessControl,
-    AccessRule,
-    Flow,
-    Message,
-    Remote,
-    RemoteRights,
-)
-from sros_tool.zenoh.configuration import (
-    Configuration,
-    Mode,
-    RenderedReader,
-    parse_rendered,
-)
+from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, Remote, RemoteRights
+from sros_tool.zenoh.configuration import Configuration, Mode, RenderedReader, parse_rendered
 from sros_tool.zenoh.document import parse_configuration
 
 PUT = (Message.PUT, Message.DELETE)

@@ -37,13 +37,7 @@ from sros_tool.keystore.ledger import LEDGER_REMEDY, RESTORED
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.keystore.template import is_ca_service
-from sros_tool.pki.certificates import (
-    authority_text,
-    same_key,
-    subject_text,
-    validity_of,
-    weakness,
-)
+from sros_tool.pki.certificates import authority_text, same_key, subject_text, validity_of, weakness
 from sros_tool.pki.chains import denies_issuing, purpose_faults
 from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, few_rounds_clause, is_portable, load_key

@@ -20,13 +20,7 @@ from sros_tool.checks.keystores.topic_names import check_topic_names
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.decision.access import is_open_to_unauthenticated
 from sros_tool.dds.decision.grants import read_date
-from sros_tool.dds.decision.vendors import (
-    FAST_DDS,
-    TESTED,
-    DateRule,
-    Vendor,
-    joined_titles,
-)
+from sros_tool.dds.decision.vendors import FAST_DDS, TESTED, DateRule, Vendor, joined_titles
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Rule, portability_problems

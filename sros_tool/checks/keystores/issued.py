@@ -35,11 +35,7 @@ from sros_tool.keystore.layout import (
     is_original_keystore,
 )
 from sros_tool.keystore.protection import unfulfilled_protections
-from sros_tool.pki.certificates import (
-    authority_text,
-    load_certificates,
-    readable_fingerprints,
-)
+from sros_tool.pki.certificates import authority_text, load_certificates, readable_fingerprints
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy.model import stated_protections
 from sros_tool.policy.rights import Right, compare, policy_rights

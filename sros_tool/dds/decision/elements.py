@@ -14,13 +14,7 @@ from lxml import etree
 
 from sros_tool.dds.decision.access import Outcome, Refusal
 from sros_tool.dds.decision.vendors import VendorTraits
-from sros_tool.dds.governance import (
-    DomainRule,
-    Governance,
-    TopicRule,
-    attributes,
-    parse_governance,
-)
+from sros_tool.dds.governance import DomainRule, Governance, TopicRule, attributes, parse_governance
 from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.xml import tag_of
 

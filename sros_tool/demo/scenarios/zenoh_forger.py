@@ -26,12 +26,7 @@ from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.update import set_zenoh
 from sros_tool.policy.model import Policy
-from sros_tool.runtime.environment import (
-    OVERRIDE,
-    ROUTER_URI,
-    SESSION_URI,
-    zenoh_environment,
-)
+from sros_tool.runtime.environment import OVERRIDE, ROUTER_URI, SESSION_URI, zenoh_environment
 from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window
 from sros_tool.zenoh.access import Message

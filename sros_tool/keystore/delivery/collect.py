@@ -55,12 +55,7 @@ from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.known_keys import restored_at, revoked_serials
-from sros_tool.keystore.layout import (
-    CERTIFICATE_FILE,
-    IDENTITY,
-    confirmation_file,
-    enclave_folder,
-)
+from sros_tool.keystore.layout import CERTIFICATE_FILE, IDENTITY, confirmation_file, enclave_folder
 from sros_tool.keystore.ledger import LATER_RELEASE, REPORTED, Entry
 from sros_tool.keystore.lifecycle.change import ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import LostRecords

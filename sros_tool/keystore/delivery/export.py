@@ -65,10 +65,7 @@ from sros_tool.keystore.layout import (
     key_on_robot,
     search_enclaves,
 )
-from sros_tool.keystore.outcomes import (
-    EnclaveResult,
-    enclave_result,
-)
+from sros_tool.keystore.outcomes import EnclaveResult, enclave_result
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluate_enclave
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, read_consistently
 from sros_tool.keystore.selection import missing_enclave_error
@@ -76,11 +73,7 @@ from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.owners import refuse_link_of_stranger
-from sros_tool.pki.certificates import (
-    fingerprints,
-    load_certificates,
-    validity_of,
-)
+from sros_tool.pki.certificates import fingerprints, load_certificates, validity_of
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import parse_token_file
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words

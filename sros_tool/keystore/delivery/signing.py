@@ -22,10 +22,7 @@ from sros_tool.fleet.robots import Robot, robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import pack
 from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
-from sros_tool.keystore.fleet import (
-    EnclaveDomains,
-    refuse_stale_domains,
-)
+from sros_tool.keystore.fleet import EnclaveDomains, refuse_stale_domains
 from sros_tool.keystore.issuing.enclave import (
     Issuance,
     IssuedEnclave,

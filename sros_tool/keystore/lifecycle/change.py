@@ -52,13 +52,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     check_keystore,
 )
-from sros_tool.keystore.ledger import (
-    Entry,
-    Ledger,
-    append,
-    certificate_entry,
-    document_entry,
-)
+from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights, SupersededCertificate
 from sros_tool.keystore.outcomes import StagedZenoh
 from sros_tool.keystore.reader import OpenedKeystore, check_domain

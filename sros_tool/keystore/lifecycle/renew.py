@@ -23,12 +23,7 @@ from sros_tool.keystore.expiry import (
 from sros_tool.keystore.fleet import left_enclaves, revoke_command
 from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.issuing.ca_service import CaServiceError
-from sros_tool.keystore.issuing.enclave import (
-    EnclaveTokens,
-    EnclaveWriter,
-    Issuance,
-    NewIdentity,
-)
+from sros_tool.keystore.issuing.enclave import EnclaveTokens, EnclaveWriter, Issuance, NewIdentity
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key
 from sros_tool.keystore.ledger import RENEWED_BY_NAME, RESTORED, Entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange

@@ -38,12 +38,7 @@ from sros_tool.keystore.layout import (
     link_to_list,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import (
-    REPORTED,
-    Entry,
-    certificate_entry,
-    document_entry,
-)
+from sros_tool.keystore.ledger import REPORTED, Entry, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.replaced import SupersededCertificate
 from sros_tool.keystore.lifecycle.rotation import (
     Replacement,

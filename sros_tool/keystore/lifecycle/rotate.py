@@ -38,11 +38,7 @@ from sros_tool.keystore.issuing.authority import (
     write_bundle,
     write_copies,
 )
-from sros_tool.keystore.issuing.enclave import (
-    EnclaveWriter,
-    Issuance,
-    NewIdentity,
-)
+from sros_tool.keystore.issuing.enclave import EnclaveWriter, Issuance, NewIdentity
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring, check_places
 from sros_tool.keystore.known_keys import unknown_authorities
 from sros_tool.keystore.layout import (

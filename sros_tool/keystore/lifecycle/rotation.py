@@ -31,12 +31,7 @@ from sros_tool.keystore.layout import (
     ROTATION,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.pki.certificates import (
-    digest,
-    issued_by,
-    subject_text,
-    validity_of,
-)
+from sros_tool.pki.certificates import digest, issued_by, subject_text, validity_of
 from sros_tool.validity import AUTHORITY_SOON, Window, iso
 from sros_tool.values import Words, as_plain, parse_json, shows
 

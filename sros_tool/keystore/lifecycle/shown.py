@@ -33,11 +33,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.comparison import SettingChange
     from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.create import Creation
-    from sros_tool.keystore.lifecycle.rotation import (
-        AuthorityStatus,
-        RotationStage,
-        RotationStatus,
-    )
+    from sros_tool.keystore.lifecycle.rotation import AuthorityStatus, RotationStage, RotationStatus
     from sros_tool.keystore.lifecycle.update import UpdateStage
     from sros_tool.zenoh.configuration import ZenohNetwork
 

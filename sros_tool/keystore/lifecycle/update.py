@@ -37,12 +37,7 @@ from sros_tool.keystore.expiry import (
 )
 from sros_tool.keystore.fleet import EnclaveDomains, robot_of_router
 from sros_tool.keystore.issuing.ca_service import CaServiceError
-from sros_tool.keystore.issuing.enclave import (
-    Issuance,
-    NewIdentity,
-    StatedRights,
-    default_rights,
-)
+from sros_tool.keystore.issuing.enclave import Issuance, NewIdentity, StatedRights, default_rights
 from sros_tool.keystore.layout import (
     GOVERNANCE_XML,
     PERMISSIONS,
@@ -56,12 +51,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     waits_for_answer,
 )
-from sros_tool.keystore.lifecycle.change import (
-    Changed,
-    ChangeOptions,
-    KeystoreChange,
-    remove_zenoh,
-)
+from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange, remove_zenoh
 from sros_tool.keystore.lifecycle.create import (
     Creation,
     creation,

@@ -11,14 +11,7 @@ from functools import cache
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from tests.dds.decision_documents import (
-    allow,
-    grant,
-    permissions,
-    publish,
-    subscribe,
-    topic_rule,
-)
+from tests.dds.decision_documents import allow, grant, permissions, publish, subscribe, topic_rule
 from tests.integration.vendor_rows import domain_rule, governance
 from tests.support.raw_pki import (
     AUTHORITY_KEY,

@@ -6,10 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ansible_collections.sros.fleet.plugins.module_utils.exports import (
-    RefusedError,
-    check_enclave,
-)
+from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError, check_enclave
 from ansible_collections.sros.fleet.plugins.module_utils.home import harmless
 
 _MOST_BYTES = 16 << 20
