@@ -562,7 +562,8 @@ class _MinimizeVerb(SeveralValues):
     show_default=True,
     help="`difference`: exit with 1 if POLICY has rights to remove, wildcards to replace, or "
     "rights that were used only in part; if POLICY lacks an observed right; or if an enclave is "
-    "only in POLICY or only in OBSERVED. With --fleet, an enclave also counts if it was "
+    "only in POLICY or only in OBSERVED, or if nodes that POLICY has in several enclaves were "
+    "observed in one process. With --fleet, an enclave also counts if it was "
     "not observed for every robot. Without --fleet, sros also compares each node of an enclave, if "
     "OBSERVED has profiles of the nodes.",
 )
@@ -619,7 +620,8 @@ def minimize_policy(
     saved = save(output, minimized.document) if output and not dry_run else ""
     if as_json:
         kept = output if not dry_run else None
-        plain = as_plain(PolicyMinimization(policy, kept, enclaves, dry_run, changes, notes))
+        same = minimized.is_as_observed
+        plain = as_plain(PolicyMinimization(policy, kept, enclaves, same, dry_run, changes, notes))
         print_json({**plain, "enclaves": _as_written(plain["enclaves"])})
     else:
         for enclave in enclaves:

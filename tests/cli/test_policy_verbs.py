@@ -545,6 +545,9 @@ def test_nodes_of_one_process_count_for_their_own_enclaves_in_the_policy(folder:
         file("seen.xml", seen)
         ended = sros(*words)
         assert (ended.status, said in ended.err) == (status, True), seen
+        assert ("so this is a difference" in ended.err) == bool(status)
+        as_data = json.loads(sros(*words, "--json").out)
+        assert as_data["is_as_observed"] is not bool(status)
         assert "not allowed" not in ended.out and "never observed;" not in ended.out
         assert ended.err.count("[") == bool(said), ended.err
         view = sros("view", "robot.xml", "--observed", "seen.xml", "--json").ok()

@@ -120,6 +120,9 @@ class PolicyMinimization(NamedTuple):
     """The written file; null if none was written."""
     enclaves: Sequence[MinimizedEnclave]
     """The enclaves of the policy."""
+    is_as_observed: bool
+    """False if the policy and the observations differ, so that --fail-on difference exits with 1.
+    Then the enclaves or the notes name what differs."""
     dry_run: DryRun
     changes: FileChanges
     notes: Notes
@@ -205,10 +208,11 @@ def _note_on_moved(path: str, homes: Mapping[str, str]) -> Note:
         )
         return Note("minimize.enclave-of-node", text)
     text = (
-        f"{nodes} were observed in one enclave, but the policy has them in {enumerated(places)}. "
-        "So the rights of each node count for its own enclave. If one process composes these "
-        "nodes, first put them into one enclave (`sros merge_policy EMPTY POLICY --enclave "
-        "ENCLAVE`, with --node for each), and use the result as POLICY."
+        f"{nodes} were observed in one process, but the policy has them in {enumerated(places)}. "
+        "A process runs in only one enclave, so this is a difference, even if the rights of each "
+        "node are those of its enclave. If these nodes always run in one process, put them into "
+        "one enclave (`sros merge_policy EMPTY POLICY --enclave ENCLAVE`, with --node for each), "
+        "and use the result as POLICY. Otherwise, observe them in a process for each enclave."
     )
     return Note("minimize.divided-process", text)
 
