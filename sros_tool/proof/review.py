@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from itertools import chain
 from pathlib import Path
 from shlex import quote
@@ -27,9 +27,9 @@ from sros_tool.checks.keystores.issued import (
     STALE,
 )
 from sros_tool.checks.keystores.opened import Circumstances
-from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter, FindingKind
+from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.policies import is_mended_by
-from sros_tool.checks.requirements import ALLOWED_BY_NAME, HOLDS_ALONE, VACUOUS, VIOLATED
+from sros_tool.checks.requirements import DROPPED
 from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
@@ -64,9 +64,9 @@ from sros_tool.keystore.rights import (
 )
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import Policy, policy_in_namespace
+from sros_tool.policy.model import Policy
 from sros_tool.policy.remapping import Remapping
-from sros_tool.policy.rights import Right, placed_rights, policy_rights
+from sros_tool.policy.rights import policy_rights
 from sros_tool.proof.commit_files import (
     ATTRIBUTES_FILE,
     EXPORT_IGNORE,
@@ -80,39 +80,23 @@ from sros_tool.proof.commit_files import (
     may_include_files,
     may_match,
 )
-from sros_tool.proof.escapes import (
-    MOST_NAMESPACES,
-    RobotMoves,
-    access_by_name_findings,
-    lost_restriction_findings,
-    namespaces_in,
-    namespaces_of_patterns,
-    rights_with_new_peers,
-    unanswered_requirement_findings,
-)
+from sros_tool.proof.escapes import MOST_NAMESPACES
 from sros_tool.proof.findings import (
-    Decisions,
     common_namespaces,
-    decide_all,
-    decided_findings,
     left_out_robot_findings,
-    requirement_findings,
     unused_remapping_findings,
 )
 from sros_tool.proof.growth import Growth, compare_access
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
-from sros_tool.proof.requirements import (
-    KINDS,
-    FleetSource,
-    Requirement,
-    dropped_findings,
-    dropped_requirements,
-    read_all_requirements,
-    read_requirements,
-    renamed_names,
+from sros_tool.proof.requirements import KINDS, FleetSource, Requirement, read_requirements
+from sros_tool.proof.reviewed_requirements import (
+    ONLY_THE_CHANGE,
+    RequirementFiles,
+    ReviewedRequirements,
+    ReviewedSubject,
 )
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
-from sros_tool.proof.system import System, load_system, policy_system
+from sros_tool.proof.system import load_system, policy_system
 from sros_tool.values import Words
 from sros_tool.wording import enumerated, first_few
 
@@ -393,7 +377,38 @@ def review(request: ReviewRequest, folder: Path) -> Review:
     )
 
 
-_ONLY_THE_CHANGE = "whether the change breaks them"
+@dataclass(frozen=True)
+class _Policies:
+    """The policy files of BASE or HEAD, and the fleet of this commit (None without a fleet)."""
+
+    commit: str
+    files: Sequence[Path]
+    fleet: Fleet | None
+
+    def read(self) -> tuple[Policy, ...]:
+        """Return the policies for the robots of the fleet.
+
+        Raises:
+            SrosError: a policy cannot be read.
+        """
+        return tuple(read_policy_for(file, self.fleet) for file in self.files)
+
+    @cached_property
+    def access(self) -> AccessSource:
+        """The access that the policies give; reading it may raise an error."""
+        return load_policies(self.files, self.commit, self.fleet)
+
+    def robots_by_enclave(self) -> dict[str, Robot | None]:
+        """Map enclaves to the robot that gets their keys, or to None if they are of no robot."""
+        fleet = self.fleet
+        if fleet is None:
+            return {enclave.path: None for policy in self.read() for enclave in policy.enclaves}
+        policies = [FleetPolicy(read_policy(of, placeholders=True), fleet) for of in self.files]
+        return {
+            path: policy.stated_enclave(path)[1] or robot_of(fleet, path)
+            for policy in policies
+            for path in policy
+        }
 
 
 @dataclass(slots=True)
@@ -409,7 +424,7 @@ class _Review:
     """Whether a requirement has a name that moves with the namespace."""
     namespaces_to_add: set[str] = field(default_factory=set)
     """Namespaces in which the policies or keystores have names of the requirements."""
-    decided_elsewhere: str = _ONLY_THE_CHANGE
+    decided_elsewhere: str = ONLY_THE_CHANGE
     """What the review decided about requirements in other namespaces; "" for nothing."""
 
     def _allows(self, kind: str) -> bool:
@@ -434,70 +449,56 @@ class _Review:
             yield ReviewStep("files", "", _UNDECIDED, refusal)
         head_fleet = yield from self._fleet(self.head)
         base_fleet = yield from self._fleet(self.base)
-        of_head = yield from self._policies(self.head, head_fleet)
-        of_base: list[Path] = []
-        if self.base:
-            with suppress(SrosError, OSError):  # the comparison reports the error
-                of_base = [
-                    file
-                    for path in asked.policies
-                    for file in self.base.write_policies(path, placeholders=base_fleet is not None)
-                ]
+        head = _Policies(_HEAD, (yield from self._head_policies(head_fleet)), head_fleet)
+        base = _Policies(_BASE, (), base_fleet)
+        with suppress(SrosError, OSError):  # the comparison reports the error
+            base = replace(base, files=self._base_policies(base_fleet))
         named = " ".join(asked.policies)
         complete = self.has_all_policies
-        findings = partial(self._policy_findings, of_head, head_fleet)
         if head_fleet:
-            self.robots[named] = fleet_with_enclaves(head_fleet, of_head)
+            self.robots[named] = fleet_with_enclaves(head_fleet, head.files)
         yield from self._step_result(
-            "policy", named, findings, is_wanted=bool(of_head), complete=complete
+            "policy",
+            named,
+            partial(self._policy_findings, head),
+            is_wanted=bool(head.files),
+            complete=complete,
         )
-        keystores = yield from self._keystores(self.head)
+        keystores = yield from self._keystores()
         for path, keystore in keystores.items():
             with suppress(SrosError):  # faults of the fleet file are findings
                 self.robots[path] = load_fleet(OpenedKeystore(keystore))
         base_keystores: dict[str, Path] = {}
         if self.base:
             base_keystores = yield from _read_each("new-access", keystores, self.base.write_tree)
-        before = cache(partial(load_policies, of_base, _BASE, base_fleet))
-        earlier: dict[str, Callable[[], AccessSource]] = {
-            path: partial(load_side, folder) for path, folder in base_keystores.items()
+        subjects: dict[str, Callable[[], ReviewedSubject]] = {
+            path: partial(self._keystore_subject, path, folder, base_keystores.get(path))
+            for path, folder in keystores.items()
         }
-        if of_base:
-            earlier[named] = before
-        after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
-        later = {path: partial(load_side, folder) for path, folder in keystores.items()}
-        both = {named: lambda: (before(), after())} if of_base else {}
-        yield from self._requirement_steps(
-            of_head, head_fleet, base_fleet, keystores, earlier, {**later, named: after}, both
-        )
+        if asked.policies:
+            subjects[named] = partial(self._policies_subject, base, head)
+        yield from self._requirement_steps(subjects, head_fleet)
         if self.base:
             yield from self._step_result(
                 "new-access",
                 named,
-                lambda: self._access_change(of_base, base_fleet, before, after),
+                partial(self._access_change, base, head),
                 is_wanted=bool(asked.policies),
                 complete=complete,
             )
-            yield from self._step_result(
-                "rights",
-                named,
-                partial(self._rights_change, before, after),
-                is_wanted=bool(of_base),
-            )
+            change = partial(self._rights_change, base, head)
+            yield from self._step_result("rights", named, change, is_wanted=bool(base.files))
         for path, keystore in keystores.items():
-            earlier_keystore = base_keystores.get(path)
-            yield from self._keystore_steps(path, keystore, earlier_keystore, of_head, head_fleet)
+            yield from self._keystore_steps(path, keystore, base_keystores.get(path), head)
         # Not allowed by --new-access: its user has read the commit, not a checkout, which may
         # differ.
         yield from self._step_result("files", "", self._git_attributes_step, can_be_allowed=False)
         yield from self._step_result("keystore", " ".join(asked.keystores), self._keys_step)
         if self.base:
-            yield from self._step_result(
-                "files", "", partial(self._unreviewed_step, of_head, head_fleet)
-            )
+            yield from self._step_result("files", "", partial(self._unreviewed_step, head))
             if head_fleet:
-                where = partial(self._fleet_step, (of_base, base_fleet), (of_head, head_fleet))
-                yield from self._step_result("new-access", asked.fleet, where)
+                moved = partial(self._fleet_step, base, head, head_fleet)
+                yield from self._step_result("new-access", asked.fleet, moved)
         for error in self.head.refused + (self.base.refused if self.base else []):
             yield ReviewStep("files", "", _UNDECIDED, error)
 
@@ -560,13 +561,22 @@ class _Review:
 
         return (yield from _read_each(kind, paths, file_at))
 
-    def _policies(
-        self, side: CommitFiles, fleet: Fleet | None
-    ) -> Generator[ReviewStep, None, list[Path]]:
-        """Return the policy files of BASE or HEAD; yield the steps that read the policies."""
+    def _base_policies(self, fleet: Fleet | None) -> list[Path]:
+        """Return the policy files that BASE has; none without BASE.
+
+        Raises:
+            SrosError: a file cannot be read.
+        """
+        if not self.base:
+            return []
+        write = partial(self.base.write_policies, placeholders=fleet is not None)
+        return [*chain.from_iterable(map(write, self.request.policies))]
+
+    def _head_policies(self, fleet: Fleet | None) -> Generator[ReviewStep, None, list[Path]]:
+        """Return the policy files of HEAD; yield a step for each policy that cannot be read."""
 
         def files_at(path: str) -> Sequence[Path]:
-            files = side.write_policies(path, placeholders=fleet is not None)
+            files = self.head.write_policies(path, placeholders=fleet is not None)
             if not files:
                 raise self._missing_file_error(path, f" If it is renamed, {_BOTH_NAMES_REMEDY}.")
             return files
@@ -575,11 +585,11 @@ class _Review:
         self.has_all_policies = len(read) == len(self.request.policies)
         return list(dict.fromkeys(file for files in read.values() for file in files))
 
-    def _keystores(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
-        """Map paths to keystores of BASE or HEAD; yield a step for each unreadable keystore."""
+    def _keystores(self) -> Generator[ReviewStep, None, dict[str, Path]]:
+        """Map paths to keystores of HEAD; yield a step for each unreadable keystore."""
 
         def folder_at(path: str) -> Path:
-            folder = side.write_tree(path)
+            folder = self.head.write_tree(path)
             if not folder:
                 raise self._missing_file_error(path)
             if not is_keystore(folder):
@@ -624,19 +634,18 @@ class _Review:
         return walk(side.repository, tree, maximum=_MOST_ENTRIES, other=before)
 
     def _fleet_step(
-        self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
+        self, base: _Policies, head: _Policies, fleet: Fleet
     ) -> tuple[int, Content] | None:
         """Return status and findings on changes of the fleet file; None without any.
 
         The rights do not show such changes: `fleet_changes`, keys that another robot gets, and
         other settings for the connections of Ansible.
         """
-        known_paths = fleet_with_enclaves(base[1], base[0]).enclaves if base[1] else ()
-        changes = [*fleet_changes(base[1], head[1], known_paths)]
-        changes += _moved_keys(
-            _robots_by_enclave(*base), _robots_by_enclave(*head), base[1], head[1]
-        )
-        if base[1] and self.base:
+        known_paths = fleet_with_enclaves(base.fleet, base.files).enclaves if base.fleet else ()
+        changes = [*fleet_changes(base.fleet, fleet, known_paths)]
+        had, have = base.robots_by_enclave(), head.robots_by_enclave()
+        changes += _moved_keys(had, have, base.fleet, fleet)
+        if base.fleet and self.base:
             file = self.request.fleet
             before, after = (
                 read_connection_settings(e.folder / file) for e in (self.base, self.head)
@@ -644,7 +653,7 @@ class _Review:
             for where in sorted({*before, *after}, key=_variables_before_hosts):
                 if before.get(where) != (value := after.get(where)):
                     is_robot = where.endswith(f".{ROBOT_VARIABLE}")
-                    if is_robot and value is None and before[where] not in head[1].robots:
+                    if is_robot and value is None and before[where] not in fleet.robots:
                         continue  # the robot is gone
                     text = "is gone" if value is None else f"is {value}"
                     effect = "this can change which keys Ansible delivers, and how"
@@ -717,9 +726,7 @@ class _Review:
         named = tuple(line for line in lines if line[1] not in entries)
         return (_FOUND, StepFindings(failing, named)) if lines else None
 
-    def _unreviewed_step(
-        self, reviewed: Sequence[Path], fleet: Fleet | None
-    ) -> tuple[int, Content] | None:
+    def _unreviewed_step(self, reviewed: _Policies) -> tuple[int, Content] | None:
         """Return status and findings on changed, unreviewed policies and keystores, or None."""
         assert self.base
         lines: list[tuple[str, str]] = []
@@ -744,7 +751,7 @@ class _Review:
             place = f"{ENCLAVES} --leave-out {PUBLIC}" if is_top else quote(path)
             text = f"is a keystore that changes and is not reviewed: {review}, or leave it out with"
             lines.append((f"{text} --leave-out {place}", path))
-        for path in self._policies_used_in_part(changed, reviewed, fleet):
+        for path in self._policies_used_in_part(changed, reviewed):
             lines.append(("changes and is used only in part: the rest is not reviewed", path))
         for path in self._unreviewed_policies_including(changed):
             lines.append(("is not reviewed, and includes a file that changes", path))
@@ -766,13 +773,10 @@ class _Review:
         return (_FOUND if lines else _OK, facts) if facts.lines else None
 
     def _policies_used_in_part(
-        self,
-        changed: Iterable[tuple[str, TreeEntry]],
-        reviewed: Sequence[Path],
-        fleet: Fleet | None,
+        self, changed: Iterable[tuple[str, TreeEntry]], reviewed: _Policies
     ) -> Iterator[str]:
         """Yield changed policies that reviewed policies or keystores include only in part."""
-        named = {str(path.relative_to(self.head.folder)) for path in reviewed}
+        named = {str(path.relative_to(self.head.folder)) for path in reviewed.files}
         known = {
             path: self.head.written_content(path)
             for path, _ in changed
@@ -784,9 +788,8 @@ class _Review:
         )
         if not policies:
             return
-        rights = {
-            right for file in reviewed for right in policy_rights(read_policy_for(file, fleet))
-        }
+        fleet = reviewed.fleet
+        rights = {right for policy in reviewed.read() for right in policy_rights(policy)}
         for path in policies:
             with suppress(SrosError):
                 (file,) = self.head.write_policies(path, placeholders=fleet is not None)
@@ -955,7 +958,7 @@ class _Review:
         options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
         if (
             not options
-            and self.decided_elsewhere == _ONLY_THE_CHANGE
+            and self.decided_elsewhere == ONLY_THE_CHANGE
             and not any(map(self._is_changed, self.request.requirements))
         ):
             return
@@ -997,36 +1000,32 @@ class _Review:
     def _circumstances(self, fleet: Fleet | None = None) -> Circumstances:
         return Circumstances(self.request.at, self.request.zone, fleet=fleet)
 
-    def _policy_findings(
-        self, policies: Sequence[Path], fleet: Fleet | None
-    ) -> tuple[int, Content]:
-        found = policy_findings(policies, self._circumstances(fleet))
+    def _policy_findings(self, head: _Policies) -> tuple[int, Content]:
+        found = policy_findings(head.files, self._circumstances(head.fleet))
         template = self._template()
-        chosen = FindingFilter().choose(e for e in found if not is_mended_by(template, e))
-        return _status_of_findings(chosen), chosen
+        return _chosen(finding for finding in found if not is_mended_by(template, finding))
 
-    def _access_change(
-        self,
-        base_paths: Sequence[Path],
-        base_fleet: Fleet | None,
-        before: Callable[[], AccessSource],
-        after: Callable[[], AccessSource],
-    ) -> tuple[int, Content]:
+    def _policies_subject(self, base: _Policies, head: _Policies) -> ReviewedSubject:
+        """Return the policies for the steps on requirements.
+
+        Raises:
+            SrosError: the policies of HEAD cannot be read.
+        """
+        system = load_system(head.files, self._circumstances(head.fleet), self._template())
+        read_base = (lambda: base.access) if base.files else None
+        return ReviewedSubject(system, base.fleet, read_base, lambda: head.access)
+
+    def _access_change(self, base: _Policies, head: _Policies) -> tuple[int, Content]:
         """Return the exit status for the access that the policies gain, and this access.
 
-        Without ``base_paths``, the policies are new, and the content says only this.
+        If BASE has none of the policies, they are new, and the content says only this.
         """
-        head = after()
-        if not base_paths:
-            assert self.base
-            for path in self.request.policies:  # raises the error of a file that was not read
-                self.base.write_policies(path, placeholders=base_fleet is not None)
-            text = (
-                f"is new, so that all of its access is new; if it is renamed, {_BOTH_NAMES_REMEDY}"
-            )
-            new = ((text, " ".join(self.request.policies)),)
-            return _FOUND, StepFindings(new)
-        return self._compared_access(before(), head)
+        after = head.access
+        if base.files:
+            return self._compared_access(base.access, after)
+        self._base_policies(base.fleet)  # raises the error of a file that was not read
+        text = f"is new, so that all of its access is new; if it is renamed, {_BOTH_NAMES_REMEDY}"
+        return _FOUND, StepFindings(((text, " ".join(self.request.policies)),))
 
     @staticmethod
     def _compared_access(before: AccessSource, after: AccessSource) -> tuple[int, Content]:
@@ -1035,11 +1034,9 @@ class _Review:
         return status, AccessChange(before, after, growth)
 
     @staticmethod
-    def _rights_change(
-        before: Callable[[], AccessSource], after: Callable[[], AccessSource]
-    ) -> tuple[int, Content] | None:
+    def _rights_change(base: _Policies, head: _Policies) -> tuple[int, Content] | None:
         """Return the changed rights with the exit status, or None if no right changed."""
-        first, second = before().as_rights(), after().as_rights()
+        first, second = base.access.as_rights(), head.access.as_rights()
         first, second = (
             without_enclaves_of_sros(first, second),
             without_enclaves_of_sros(second, first),
@@ -1050,233 +1047,93 @@ class _Review:
     # ── requirements ───────────────────────────────────────────────────────────────────────
 
     def _requirement_steps(
-        self,
-        policies: Sequence[Path],
-        fleet: Fleet | None,
-        base_fleet: Fleet | None,
-        keystores: Mapping[str, Path],
-        earlier_sources: Mapping[str, Callable[[], AccessSource]],
-        later_sources: Mapping[str, Callable[[], AccessSource]],
-        compared_sides: Mapping[str, Callable[[], tuple[AccessSource, AccessSource]]],
+        self, subjects: Mapping[str, Callable[[], ReviewedSubject]], fleet: Fleet | None
     ) -> Iterator[ReviewStep]:
-        if not self.request.requirements:
+        """Yield the steps on the requirements of each subject; ``fleet`` is that of HEAD."""
+        paths = self.request.requirements
+        if not paths:
             return
-        paths, base_files = self.request.requirements, dict[str, Path]()
+        base_files = dict[str, Path]()
         files = yield from self._files(self.head, "requirements", paths)
         if self.base:
             base_files = yield from self._files(self.base, "requirements", paths)
-        at = self._circumstances()
-        systems: dict[str, Callable[[], System]] = {
-            path: partial(
-                load_system,
-                folder,
-                replace(at, opened={folder: OpenedKeystore(folder, lacks_keys=True)}),
-            )
-            for path, folder in keystores.items()
-        }
-        if self.request.policies:
-            named = " ".join(self.request.policies)
-            systems[named] = lambda: load_system(
-                policies, self._circumstances(fleet), self._template()
-            )
-        if not systems:
+        if not subjects:
             yield from self._read_requirements(files, lambda: fleet)
-        for subject, load in systems.items():
+        for name, load in subjects.items():
             try:
-                system = load()
-                before = self._keystore_fleet(subject) if subject in keystores else base_fleet
+                subject = load()
             except (SrosError, OSError) as error:
-                yield _undecided_step("requirements", subject, error)
+                yield _undecided_step("requirements", name, error)
                 continue
-            read = yield from self._read_requirements(files, system.fleet)
-            wanted = [*chain.from_iterable(read.values())]
-            self.is_relative |= any(requirement.is_relative for requirement in wanted)
-            self.namespaces_to_add |= common_namespaces(wanted, system.rights)
-            earlier = yield from self._read_requirements(
-                base_files, partial(_without_removed_robots, before, system.fleet)
-            )
-            rights, later_rights = frozenset[Right](), frozenset[Right]()
-            with suppress(SrosError, OSError):  # the comparison reports the error
-                if subject in earlier_sources:
-                    rights, later_rights = (
-                        sides[subject]().rights for sides in (earlier_sources, later_sources)
-                    )
-            sources = compared_sides.get(subject)
-            elsewhere = partial(
-                self._failing_elsewhere,
-                files.values(),
-                base_files.values(),
-                wanted,
-                sources,
-            )
-            required_before = [*chain.from_iterable(earlier.values())]
-            known = partial(self._known_notes, required_before, system, sources)
-            yield from self._step_result(
-                "requirements",
+            required = ReviewedRequirements(
                 subject,
-                partial(
-                    self._decided_requirements,
-                    files.values(),
-                    wanted,
-                    system,
-                    rights,
-                    required_before,
-                    elsewhere,
-                    known,
-                ),
-                is_wanted=bool(read),
-                complete=len(read) == len(paths)
-                and (subject in keystores or self.has_all_policies),
+                head=(yield from self._read_requirements(files, subject.system.fleet)),
+                base=(yield from self._read_requirements(base_files, subject.earlier_robots)),
+                namespaces=self.request.namespaces,
+                remaps=self.request.remaps,
+                has_fleet=bool(self.request.fleet),
+                system_of=lambda of: policy_system(of, self._circumstances(), self._template()),
             )
-            moves = RobotMoves()
-            with suppress(SrosError, OSError):  # the step on requirements reports the error
-                moves = RobotMoves.between(before, system.fleet())
-            if moves.namespaces and earlier:
-                moved = read_all_requirements(
-                    [base_files[path] for path in earlier],
-                    partial(_without_removed_robots, moves.fleet, system.fleet),
-                    self.request.namespaces,
-                    self.request.remaps,
-                )
-                try:
-                    required_before = moves.follow(required_before, moved, wanted, system)
-                except SrosError as error:
-                    yield _undecided_step("requirements-before", subject, error)
-                    continue
-            decide = partial(
-                self._dropped_step,
-                required_before,
-                wanted,
-                system,
-                sources,
-                (rights, later_rights),
-                moves,
-            )
-            yield from self._step_result(
-                "requirements-before", subject, decide, is_wanted=len(read) == len(files)
-            )
+            yield from self._steps_of_subject(name, required)
+
+    def _steps_of_subject(self, name: str, required: ReviewedRequirements) -> Iterator[ReviewStep]:
+        system, files, read = required.subject.system, required.head.files, required.head.read
+        self.is_relative |= required.is_relative
+        self.namespaces_to_add |= common_namespaces(required.head.requirements, system.rights)
+        yield from self._step_result(
+            "requirements",
+            name,
+            partial(self._decided_requirements, required),
+            is_wanted=bool(read),
+            complete=len(read) == len(self.request.requirements)
+            and (system.is_keystore or self.has_all_policies),
+        )
+        dropped = partial(self._dropped_step, required)
+        all_read = len(read) == len(files)
+        yield from self._step_result("requirements-before", name, dropped, is_wanted=all_read)
 
     def _read_requirements(
         self, files: Mapping[str, Path], fleet: FleetSource
-    ) -> Generator[ReviewStep, None, dict[str, Sequence[Requirement]]]:
-        """Map paths to the requirements of files; yield a step for each unreadable file."""
+    ) -> Generator[ReviewStep, None, RequirementFiles]:
+        """Return the requirements in files; yield a step for each unreadable file."""
 
         def requirements_at(path: str) -> Sequence[Requirement]:
             asked = self.request
             return read_requirements(files[path], fleet, asked.namespaces, asked.remaps)
 
-        return (yield from _read_each("requirements", files, requirements_at))
+        read = yield from _read_each("requirements", files, requirements_at)
+        return RequirementFiles(files, read)
 
-    def _decided_requirements(
-        self,
-        files: Collection[Path],
-        requirements: Sequence[Requirement],
-        system: System,
-        before: Iterable[Right],
-        earlier: Sequence[Requirement],
-        elsewhere: Callable[[Decisions], Iterable[Finding]],
-        known_notes: Callable[[], Collection[tuple[FindingKind, str]]],
-    ) -> tuple[int, ChosenFindings]:
+    def _decided_requirements(self, required: ReviewedRequirements) -> tuple[int, ChosenFindings]:
         """Return the exit status and the findings on requirements, also in other namespaces."""
-        asked = self.request
-        decided = decide_all(requirements, system)
-        own = decided_findings(decided, system, before, earlier)
-        if any(finding.kind in _LASTING_NOTES for finding in own):
-            known = known_notes()
-            own = [of for of in own if (of.kind, of.text) not in known]
-        findings = [
-            *own,
-            *left_out_robot_findings(system, asked.namespaces),
-            *elsewhere(decided),
-            *unused_remapping_findings(files, system, asked.namespaces, asked.remaps),
-        ]
+        asked, system = self.request, required.subject.system
+        findings = required.findings_here()
+        findings += left_out_robot_findings(system, asked.namespaces)
+        if required.is_relative and self.decided_elsewhere:
+            self.decided_elsewhere = required.decided_elsewhere()
+        findings += required.findings_elsewhere()
+        findings += unused_remapping_findings(
+            required.head.files.values(), system, asked.namespaces, asked.remaps
+        )
         # In several namespaces, a requirement with absolute names is decided several times.
-        chosen = FindingFilter().choose(dict.fromkeys(findings))
-        return _status_of_findings(chosen), chosen
+        return _chosen(dict.fromkeys(findings))
 
-    def _known_notes(
-        self,
-        earlier: Sequence[Requirement],
-        system: System,
-        sources: Callable[[], tuple[AccessSource, AccessSource]] | None,
-    ) -> Collection[tuple[FindingKind, str]]:
-        """Return kinds and texts of BASE's notes that each review would repeat.
+    def _dropped_step(self, required: ReviewedRequirements) -> tuple[int, Content] | None:
+        """Return status and findings on requirements that HEAD drops or weakens, or None."""
+        count, findings = required.dropped()
+        if not count:
+            return None
+        chosen = FindingFilter().choose(map(self._placed_in_head, findings))
+        return _FOUND, DroppedRequirements(count, chosen)
 
-        The change has not caused them.
-        """
-        if system.is_keystore or self.request.fleet or not sources:
-            return ()
-        with suppress(SrosError, OSError):  # the comparison reports the error
-            policy = Policy(tuple(sources()[0].enclaves.values()))
-            before = policy_system(policy, self._circumstances(), self._template())
-            findings = requirement_findings(earlier, replace(before, file=system.file))
-            return {(of.kind, of.text) for of in findings if of.kind in _LASTING_NOTES}
-        return ()
-
-    def _failing_elsewhere(
-        self,
-        files: Iterable[Path],
-        base_files: Iterable[Path],
-        requirements: Sequence[Requirement],
-        sources: Callable[[], tuple[AccessSource, AccessSource]] | None,
-        decided: Decisions,
-    ) -> Iterator[Finding]:
-        """Yield findings on requirements that fail in another namespace only because of the change.
-
-        A requirement fails if it is broken, or if no right is left for any name in it.  It does not
-        fail because of the change if BASE has the same failure under names that the change renames.
-        Users may put the nodes of a package, and its requirements, into their own namespaces.
-        ``requirements`` are the requirements in ``files`` for the namespace /, and ``decided`` are
-        the decisions on them.
-        """
-        asked = self.request
-        if not any(requirement.is_relative for requirement in requirements):
-            return
-        if asked.namespaces or asked.fleet or not sources:
-            self.decided_elsewhere = ""
-            return
-        base, head = sources()
-        namespaces = _namespaces_to_try(base, head)
-        if len(namespaces) > MOST_NAMESPACES and self.decided_elsewhere:
-            self.decided_elsewhere = (
-                f"whether the change breaks them in {MOST_NAMESPACES} of {len(namespaces)} "
-                "namespaces (those of changed names first)"
-            )
-        failing = {violation.requirement for violation in decided.violations}
-        failing |= {requirement for requirement, _ in decided.vacuous}
-        # In the namespaces of its own patterns, a requirement is for other enclaves than in /.
-        left = {
-            at: [*namespaces[:MOST_NAMESPACES], *namespaces_of_patterns(here)[1:]]
-            for at, here in enumerate(requirements)
-            if here.is_relative and here not in failing
-        }
-
-        def system_in(ns: str, source: AccessSource) -> System:
-            policy = policy_in_namespace(Policy(tuple(source.enclaves.values())), ns)
-            system = policy_system(policy, self._circumstances(), self._template())
-            return replace(system, is_package=True)
-
-        for ns in dict.fromkeys([*namespaces[:MOST_NAMESPACES], *chain(*left.values())]):
-            moved, earlier = (
-                read_all_requirements(paths, namespaces=(ns,), remaps=asked.remaps)
-                for paths in (files, base_files)
-            )
-            before, after = cache(partial(system_in, ns, base)), system_in(ns, head)
-            dropped = cache(partial(_dropped_failures, earlier, moved, before))
-            for at in [at for at in left if ns in left[at]]:
-                broken = _failures(moved[at], after, before, earlier)
-                if not broken:
-                    continue
-                known = {*_failures(moved[at], before()), *_with_new_names(moved[at], dropped())}
-                if known.issuperset(broken):
-                    continue
-                if breaking := frozenset[str]().union(*(failure.enclaves for failure in known)):
-                    broken = _failures(moved[at], after, before, earlier, breaking)
-                place = f"in namespace {ns}, which the review tries"
-                for failure, finding in broken.items():
-                    if failure not in known:
-                        left.pop(at, None)
-                        yield finding._replace(text=f"{place}: {finding.text}")
+    def _placed_in_head(self, finding: Finding) -> Finding:
+        """Return a finding; if it has no place, with the place in HEAD of what was required."""
+        if finding.file or finding.kind is not DROPPED:
+            return finding
+        assert self.base
+        (required_before,) = finding.related
+        path = Path(required_before.file).relative_to(self.base.folder)
+        return finding._replace(file=str(self.head.folder / path))
 
     def place(self) -> str:
         """Return a clause with the namespaces of the requirements; "" without namespaces."""
@@ -1303,65 +1160,34 @@ class _Review:
         except DocumentError:  # a link is on the path, perhaps only in BASE
             return True
 
+    # ── keystores ──────────────────────────────────────────────────────────────────────────
+
     def _keystore_fleet(self, path: str) -> Fleet | None:
         """Return the fleet of a keystore in BASE; None for a keystore without fleet."""
         file = self.base.write_file(f"{path}/{FLEET}") if self.base else None
         return read_fleet(file) if file else None
 
-    def _dropped_step(
-        self,
-        earlier: Sequence[Requirement],
-        wanted_requirements: Sequence[Requirement],
-        system: System,
-        compared_sides: Callable[[], tuple[AccessSource, AccessSource]] | None,
-        rights: tuple[Collection[Right], Collection[Right]],
-        moves: RobotMoves,
-    ) -> tuple[int, Content] | None:
-        dropped = [
-            requirement.requirement
-            for requirement in dropped_requirements(earlier, wanted_requirements)
-        ]
-        sources = None
-        with suppress(SrosError, OSError):  # the comparison reports the error
-            sources = compared_sides() if compared_sides else None
-        left = [*unanswered_requirement_findings(earlier, wanted_requirements, *rights)]
-        if sources:
-            left += lost_restriction_findings(earlier, wanted_requirements, *sources, moves)
-            left += access_by_name_findings(earlier, wanted_requirements, *sources, system)
-        if not (dropped or left):
-            return None
-        assert self.base
-        findings = [
-            finding
-            if finding.file
-            else finding._replace(
-                file=str(self.head.folder / Path(place.file).relative_to(self.base.folder))
-            )
-            for finding in dropped_findings(
-                earlier, wanted_requirements, "", moves.clauses, rights_with_new_peers(*rights)
-            )
-            for place in finding.related
-        ]
-        broken = [of for of in requirement_findings(dropped, system) if of.kind is VIOLATED]
-        chosen = FindingFilter().choose([*findings, *left, *broken])
-        return _FOUND, DroppedRequirements(len(dropped) + len(left), chosen)
+    def _keystore_subject(self, path: str, folder: Path, before: Path | None) -> ReviewedSubject:
+        """Return a keystore for the steps on requirements; ``before`` is the keystore of BASE.
 
-    # ── keystores ──────────────────────────────────────────────────────────────────────────
+        Raises:
+            SrosError: the keystore cannot be read.
+        """
+        opened = {folder: OpenedKeystore(folder, lacks_keys=True)}
+        return ReviewedSubject(
+            load_system(folder, replace(self._circumstances(), opened=opened)),
+            self._keystore_fleet(path),
+            partial(load_side, before) if before else None,
+            partial(load_side, folder),
+        )
 
     def _keystore_steps(
-        self,
-        path: str,
-        folder: Path,
-        before: Path | None,
-        policies: Sequence[Path],
-        fleet: Fleet | None,
+        self, path: str, folder: Path, before: Path | None, policies: _Policies
     ) -> Iterator[ReviewStep]:
-        settings = f"{path}/{SETTINGS}"
-        is_same = before is not None and _is_same_file(self.base, self.head, settings)
-
+        has_new_settings = not before or self._is_changed(f"{path}/{SETTINGS}")
         stated: tuple[Policy, ...] = ()
         with suppress(SrosError, OSError):  # the step on policies reports the error
-            stated = tuple(read_policy_for(file, fleet) for file in policies)
+            stated = policies.read()
         circumstances = replace(self._circumstances(self.robots.get(path)), policies=stated)
 
         @cache
@@ -1375,13 +1201,12 @@ class _Review:
                 if (finding.id != _FILE_MISSING or Path(finding.file).name != KEY_FILE)
                 and (not finding.file or _is_below(os.path.normpath(finding.file), (str(folder),)))
             )
-            strict = bool(self.base) and not is_same
-            chosen = FindingFilter(exclude=_UNSIGNED_POLICY_IDS, strict=strict).choose(findings)
-            return _status_of_findings(chosen), chosen
+            strict = bool(self.base) and has_new_settings
+            wanted = FindingFilter(exclude=_UNSIGNED_POLICY_IDS, strict=strict)
+            return _chosen(findings, wanted)
 
         def signed() -> tuple[int, Content]:
-            chosen = FindingFilter(include=_UNSIGNED_POLICY_IDS).choose(all_findings())
-            return _status_of_findings(chosen), chosen
+            return _chosen(all_findings(), FindingFilter(include=_UNSIGNED_POLICY_IDS))
 
         def access() -> tuple[int, Content]:
             if before:
@@ -1457,18 +1282,6 @@ def _moved_keys(
         yield FleetChange(robot.name, f"gets the keys of {enclave}, which {had} had before")
 
 
-def _robots_by_enclave(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | None]:
-    """Map enclaves to the robot that gets their keys, or to None if they belong to no robot."""
-    if fleet is None:
-        return {enclave.path: None for file in files for enclave in read_policy(file).enclaves}
-    policies = [FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files]
-    return {
-        path: policy.stated_enclave(path)[1] or robot_of(fleet, path)
-        for policy in policies
-        for path in policy
-    }
-
-
 _FILES_OF_ENCLAVES = (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES)
 _TRUSTED_FILES = (CRL, *map(ca_certificate_path, ROLES))
 """The files of a keystore that all enclaves trust."""
@@ -1492,145 +1305,12 @@ def _is_below(path: str, folders: Iterable[str]) -> bool:
     return any(f"{path}/".startswith(f"{folder}/") for folder in folders)
 
 
-def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> bool:
-    return base is not None and base.files.get(path) == head.files.get(path)
-
-
-def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
-    """Return namespaces in which requirements that hold in ``/`` may be broken.
-
-    The first namespace is in no right, and stands for all other such namespaces. It is followed by
-    the namespaces in names that do not move with the namespace, and by namespaces that wildcards in
-    these names match; namespaces of added and removed rights come first.
-    """
-    enclaves = (*before.enclaves.values(), *after.enclaves.values())
-    placed = chain.from_iterable(map(placed_rights, enclaves))
-    fixed = {of.right.name for of in placed if of.written.startswith(("/", "*"))}
-    changed = {right.name for right in before.rights ^ after.rights}
-    names = sorted(fixed, key=lambda name: (name not in changed, name))
-    ordinary = "/any_namespace"
-    while any(ordinary in right.name for right in (*before.rights, *after.rights)):
-        ordinary += "_"
-    return [*dict.fromkeys([ordinary, *namespaces_in(names)])]
-
-
-_LASTING_NOTES = (HOLDS_ALONE, ALLOWED_BY_NAME)
-"""Notes that each review of a policy would repeat."""
-
-
-class _Failure(NamedTuple):
-    """The failure of a requirement: uses that break it, or a text on why it protects nothing."""
-
-    uses: tuple[tuple[str, str, str, str], ...] = ()
-    """Enclaves, rights, names, and the wildcards that allow them ("" without wildcard)."""
-    others: frozenset[str] = frozenset()
-    """Further enclaves that break the requirement."""
-    worlds: tuple[str, ...] = ()
-    missing: str = ""
-    """An enclave that has to have rights, and does not exist."""
-    idle: bool = False
-    """Whether the enclave that has to have rights cannot start."""
-    text: str = ""
-
-    @property
-    def enclaves(self) -> frozenset[str]:
-        """All enclaves that break the requirement."""
-        return self.others.union(enclave for enclave, *_ in self.uses)
-
-    def with_new_names(self, names: Mapping[tuple[str, str], str]) -> _Failure:
-        """Return the same failure under new names, which are given by right and old name."""
-
-        def renamed(right: str, name: str) -> str:
-            for (of_right, old), new in names.items():
-                begin = old.removesuffix("*")
-                if right == of_right and (name == old or (begin != old and name.startswith(begin))):
-                    return new.removesuffix("*") + name.removeprefix(begin)
-            return name
-
-        uses = tuple(
-            (enclave, right, renamed(right, name), renamed(right, by))
-            for enclave, right, name, by in self.uses
-        )
-        new_names = {old: new for (_, old), new in names.items()}
-        text = _ABSOLUTE_NAME.sub(lambda match: new_names.get(match[0], match[0]), self.text)
-        return self._replace(uses=uses, text=text)
-
-
-_ABSOLUTE_NAME = re.compile(r"(?<!\S)(?<!enclave )/[^\s,;:()]*")
-
-
-def _failures(
-    requirement: Requirement,
-    system: System,
-    before: Callable[[], System] | None = None,
-    earlier: Sequence[Requirement] = (),
-    breaking: frozenset[str] = frozenset(),
-) -> dict[_Failure, Finding]:
-    """Return the findings which say that a requirement does not hold, or protects nothing.
-
-    A name that no right states counts only if a right of ``before`` states it; for `Nobody`, only
-    if the ``earlier`` requirements forbid it already.  The place of a finding is a right of an
-    enclave that is not in ``breaking``, if such an enclave breaks the requirement.
-    """
-    decided = decide_all([requirement], system, breaking)
-    rights = before().rights if before and decided.unnamed else ()
-    findings = decided_findings(decided, system, rights, earlier)
-    failures = {
-        _Failure(text=finding.text): finding for finding in findings if finding.kind is VACUOUS
-    }
-    broken = (finding for finding in findings if finding.kind is VIOLATED)
-    for violation, finding in zip(decided.violations, broken, strict=True):
-        steps = ((step.use, step.stated_form()[3]) for step in violation.steps)
-        uses = tuple((use.enclave, use.right, use.name, by) for use, by in steps)
-        others = {use.enclave for uses in violation.witness.others for use in uses}
-        why = violation.worlds, violation.missing, violation.idle
-        failures[_Failure(uses, frozenset(others), *why)] = finding
-    return failures
-
-
-def _dropped_failures(
-    earlier: Iterable[Requirement],
-    requirements: Iterable[Requirement],
-    before: Callable[[], System],
-) -> list[tuple[Requirement, Sequence[_Failure]]]:
-    """Return the requirements of ``earlier`` that were dropped, with their failures in BASE."""
-    dropped = dropped_requirements(earlier, requirements)
-    return [(of.requirement, [*_failures(of.requirement, before())]) for of in dropped]
-
-
-def _with_new_names(
-    requirement: Requirement, dropped: Iterable[tuple[Requirement, Sequence[_Failure]]]
-) -> Iterator[_Failure]:
-    """Yield failures of dropped requirements that differ from a requirement only in their names.
-
-    The failures have the names of the requirement.
-    """
-    for old, failures in dropped:
-        if names := renamed_names(old, requirement):
-            yield from (failure.with_new_names(names) for failure in failures)
-
-
-def _status_of_findings(chosen_findings: ChosenFindings) -> int:
-    return _FOUND if chosen_findings.fails(WARNING) else _OK
-
-
-def _without_removed_robots(before: Fleet | None, after: FleetSource) -> Fleet | None:
-    """Return the fleet ``before`` without the robots that ``after`` lacks.
-
-    If one of the two fleets is missing, the result is the other one, or None.
-
-    So no requirement counts as dropped because its robot left the fleet. A group keeps its robots
-    if all of them left.
-    """
-    now = after()
-    if before is None or now is None:
-        return before or now
-    gone = before.robots.keys() - now.robots.keys()
-    emptied = [members for members in before.groups.values() if gone.issuperset(members)]
-    gone = gone.difference(*emptied) if gone != before.robots.keys() else set()
-    return Fleet.of(
-        (robot for robot in before.robots.values() if robot.name not in gone), before.groups
-    )
+def _chosen(
+    findings: Iterable[Finding], wanted: FindingFilter | None = None
+) -> tuple[int, ChosenFindings]:
+    """Return the exit status and the wanted findings."""
+    chosen = (wanted or FindingFilter()).choose(findings)
+    return _FOUND if chosen.fails(WARNING) else _OK, chosen
 
 
 def _undecided_step(kind: str, subject: str, error: SrosError | OSError) -> ReviewStep:

@@ -150,6 +150,11 @@ class AccessSource:
     enclaves: Mapping[str, Enclave] = field(default_factory=dict)
     path_at_revision: PathAtRevision | None = None
 
+    @property
+    def policy(self) -> Policy:
+        """All enclaves as one policy; without any if the source is not a policy."""
+        return Policy(tuple(self.enclaves.values()))
+
     def subject_of(self, enclave: str) -> str:
         """Return the subject of an enclave's certificate, or else of its grant, or ""."""
         if certified := self.certified.get(enclave):
@@ -168,7 +173,7 @@ class AccessSource:
             notes=self.notes,
             fleet=self.fleet,
             protections=self.protections,
-            policy=Policy(tuple(self.enclaves.values())),
+            policy=self.policy,
         )
 
     def sources_of(self, enclave: str) -> dict[Right, Source]:

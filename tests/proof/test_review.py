@@ -28,7 +28,7 @@ from sros_tool.fleet.fleet_file import inventory, render_fleet
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, renamed_enclaves
-from sros_tool.proof import escapes, review
+from sros_tool.proof import escapes, review, reviewed_requirements
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import NODE, PROJECT
@@ -1794,7 +1794,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     ended = change.review(*asked).ok()
     assert "in namespaces other than / (add --namespace /l): sros only decided" in ended.out
     with monkeypatch.context() as patched:
-        patched.setattr(review, "MOST_NAMESPACES", 1)
+        patched.setattr(reviewed_requirements, "MOST_NAMESPACES", 1)
         some = "the change breaks them in 1 of 2 namespaces (those of changed names first)"
         assert some in change.review(*asked).ok().out
     assert (

@@ -1,0 +1,392 @@
+"""The requirements of a review: what HEAD breaks of them, and what it drops or weakens.
+
+They are decided for one subject at a time: the reviewed policies, or a keystore.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+from sros_tool.checks.kind import Finding, FindingKind
+from sros_tool.checks.requirements import ALLOWED_BY_NAME, HOLDS_ALONE, VACUOUS, VIOLATED
+from sros_tool.errors import SrosError
+from sros_tool.fleet.robots import Fleet
+from sros_tool.policy.model import Policy, policy_in_namespace
+from sros_tool.policy.remapping import Remapping
+from sros_tool.policy.rights import Right, placed_rights
+from sros_tool.proof.escapes import (
+    MOST_NAMESPACES,
+    RobotMoves,
+    access_by_name_findings,
+    lost_restriction_findings,
+    namespaces_in,
+    namespaces_of_patterns,
+    rights_with_new_peers,
+    unanswered_requirement_findings,
+)
+from sros_tool.proof.findings import Decisions, decide_all, decided_findings, requirement_findings
+from sros_tool.proof.requirements import (
+    DroppedRequirement,
+    Requirement,
+    dropped_findings,
+    dropped_requirements,
+    read_all_requirements,
+    renamed_names,
+)
+from sros_tool.proof.sources import AccessSource
+from sros_tool.proof.system import System
+
+ONLY_THE_CHANGE = "whether the change breaks them"
+_LASTING_NOTES = (HOLDS_ALONE, ALLOWED_BY_NAME)
+"""Notes that each review of a policy would repeat."""
+
+
+@dataclass(frozen=True)
+class ReviewedSubject:
+    """The policies or a keystore of a review, in BASE and in HEAD.
+
+    ``system`` has the worlds of HEAD, and ``base_fleet`` are the robots of BASE. ``read_base`` and
+    ``read_head`` read the access of both sides; ``read_base`` is None if there is nothing to
+    compare with.
+    """
+
+    system: System
+    base_fleet: Fleet | None
+    read_base: Callable[[], AccessSource] | None
+    read_head: Callable[[], AccessSource]
+
+    def policies(self) -> tuple[AccessSource, AccessSource] | None:
+        """Return the access of compared policies in BASE and HEAD; None for a keystore, too.
+
+        Raises:
+            SrosError: a policy cannot be read.
+        """
+        if self.system.is_keystore or not self.read_base:
+            return None
+        return self.read_base(), self.read_head()
+
+    @cached_property
+    def rights(self) -> tuple[Collection[Right], Collection[Right]]:
+        """The rights of BASE and HEAD; none if a side cannot be read."""
+        if self.read_base:
+            with suppress(SrosError, OSError):  # the comparison reports the error
+                return self.read_base().rights, self.read_head().rights
+        return frozenset(), frozenset()
+
+    def earlier_robots(self, moves: RobotMoves | None = None) -> Fleet | None:
+        """Return the fleet of BASE without the robots that HEAD lacks, after ``moves``.
+
+        If one of the two fleets is missing, the result is the other one, or None.
+
+        So no requirement counts as dropped because its robot left the fleet. A group keeps its
+        robots if all of them left.
+        """
+        now = self.system.fleet()
+        before = moves.fleet if moves else self.base_fleet
+        if before is None or now is None:
+            return before or now
+        gone = before.robots.keys() - now.robots.keys()
+        emptied = [members for members in before.groups.values() if gone.issuperset(members)]
+        gone = gone.difference(*emptied) if gone != before.robots.keys() else set()
+        robots = (robot for robot in before.robots.values() if robot.name not in gone)
+        return Fleet.of(robots, before.groups)
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementFiles:
+    """The requirements files of a commit, and the requirements in the files that can be read.
+
+    Both are mapped from the path in the repository.
+    """
+
+    files: Mapping[str, Path]
+    read: Mapping[str, Sequence[Requirement]]
+
+    @property
+    def requirements(self) -> list[Requirement]:
+        """All requirements that could be read, in order."""
+        return [*chain.from_iterable(self.read.values())]
+
+
+@dataclass(frozen=True)
+class ReviewedRequirements:
+    """The requirements of BASE and HEAD for one subject.
+
+    They were read for ``namespaces`` and ``remaps``.  With ``has_fleet``, the robots of the
+    policies are known.  ``system_of`` returns the worlds of a policy as the review assumes them.
+    """
+
+    subject: ReviewedSubject
+    base: RequirementFiles
+    head: RequirementFiles
+    namespaces: Sequence[str]
+    remaps: Sequence[Remapping]
+    has_fleet: bool
+    system_of: Callable[[Policy], System]
+
+    @cached_property
+    def decided(self) -> Decisions:
+        """The decisions on the requirements of HEAD."""
+        return decide_all(self.head.requirements, self.subject.system)
+
+    @property
+    def is_relative(self) -> bool:
+        """Whether a requirement of HEAD has a name that moves with the namespace."""
+        return any(requirement.is_relative for requirement in self.head.requirements)
+
+    # ── in the namespaces of the review ────────────────────────────────────────────────────
+
+    def findings_here(self) -> list[Finding]:
+        """Return the findings on the requirements of HEAD in the namespaces of the review."""
+        system, (rights, _) = self.subject.system, self.subject.rights
+        findings = decided_findings(self.decided, system, rights, self.base.requirements)
+        if any(finding.kind in _LASTING_NOTES for finding in findings):
+            known = self._known_notes()
+            findings = [of for of in findings if (of.kind, of.text) not in known]
+        return findings
+
+    def _known_notes(self) -> Collection[tuple[FindingKind, str]]:
+        """Return kinds and texts of BASE's notes that each review would repeat.
+
+        The change has not caused them.
+        """
+        with suppress(SrosError, OSError):  # the comparison reports the error
+            sides = None if self.has_fleet else self.subject.policies()
+            if sides:
+                before = replace(self.system_of(sides[0].policy), file=self.subject.system.file)
+                findings = requirement_findings(self.base.requirements, before)
+                return {(of.kind, of.text) for of in findings if of.kind in _LASTING_NOTES}
+        return ()
+
+    # ── in other namespaces ────────────────────────────────────────────────────────────────
+
+    def _package(self) -> tuple[AccessSource, AccessSource] | None:
+        """Return both sides of policies that users may put into a namespace of their own.
+
+        None if the review knows the namespaces or the robots, or compares no policies.
+        """
+        return None if self.namespaces or self.has_fleet else self.subject.policies()
+
+    def decided_elsewhere(self) -> str:
+        """Return a clause on what is decided in other namespaces; "" for nothing."""
+        package = self._package()
+        known = len(_namespaces_to_try(*package)) if package else 0
+        if known <= MOST_NAMESPACES:
+            return ONLY_THE_CHANGE if known else ""
+        return (
+            f"{ONLY_THE_CHANGE} in {MOST_NAMESPACES} of {known} namespaces (those of changed names "
+            "first)"
+        )
+
+    def findings_elsewhere(self) -> Iterator[Finding]:
+        """Yield findings on requirements that fail in another namespace only because of the change.
+
+        A requirement fails if it is broken, or if no right is left for any name in it.  It does not
+        fail because of the change if BASE has the same failure under names that the change renames.
+        """
+        package = self._package() if self.is_relative else None
+        if not package:
+            return
+        tried = _namespaces_to_try(*package)[:MOST_NAMESPACES]
+        failing = {violation.requirement for violation in self.decided.violations}
+        failing |= {requirement for requirement, _ in self.decided.vacuous}
+        # In the namespaces of its own patterns, a requirement is for other enclaves than in /.
+        left = {
+            at: [*tried, *namespaces_of_patterns(here)[1:]]
+            for at, here in enumerate(self.head.requirements)
+            if here.is_relative and here not in failing
+        }
+        for name in dict.fromkeys([*tried, *chain(*left.values())]):
+            namespace = self._in_namespace(name, *package)
+            for at in [at for at in left if name in left[at]]:
+                for finding in namespace.findings(namespace.required[at]):
+                    left.pop(at, None)
+                    place = f"in namespace {name}, which the review tries"
+                    yield finding._replace(text=f"{place}: {finding.text}")
+
+    def _in_namespace(self, name: str, base: AccessSource, head: AccessSource) -> _Namespace:
+        def system(source: AccessSource) -> System:
+            moved = policy_in_namespace(source.policy, name)
+            return replace(self.system_of(moved), is_package=True)
+
+        earlier, required = (
+            read_all_requirements(side.files.values(), namespaces=(name,), remaps=self.remaps)
+            for side in (self.base, self.head)
+        )
+        return _Namespace(earlier, required, cache(partial(system, base)), system(head))
+
+    # ── dropped by HEAD ────────────────────────────────────────────────────────────────────
+
+    def dropped(self) -> tuple[int, list[Finding]]:
+        """Return how many requirements of BASE HEAD drops or weakens, and the findings on them.
+
+        Raises:
+            SrosError: there are too many wildcards to decide a requirement.
+        """
+        moves = self._robot_moves()
+        earlier, required = self._following(moves), self.head.requirements
+        system, rights = self.subject.system, self.subject.rights
+        weakened = [*unanswered_requirement_findings(earlier, required, *rights)]
+        sides = None
+        with suppress(SrosError, OSError):  # the comparison reports the error
+            sides = self.subject.policies()
+        if sides:
+            weakened += lost_restriction_findings(earlier, required, *sides, moves)
+            weakened += access_by_name_findings(earlier, required, *sides, system)
+        renamed = rights_with_new_peers(*rights)
+        findings = dropped_findings(earlier, required, "", moves.clauses, renamed)
+        dropped = [gone.requirement for gone in dropped_requirements(earlier, required)]
+        broken = [of for of in requirement_findings(dropped, system) if of.kind is VIOLATED]
+        return len(dropped) + len(weakened), [*findings, *weakened, *broken]
+
+    def _robot_moves(self) -> RobotMoves:
+        with suppress(SrosError, OSError):  # the step on requirements reports the error
+            return RobotMoves.between(self.subject.base_fleet, self.subject.system.fleet())
+        return RobotMoves()
+
+    def _following(self, moves: RobotMoves) -> list[Requirement]:
+        """Return the requirements of BASE, with new names for robots that move."""
+        if not moves.namespaces:
+            return self.base.requirements
+        moved = read_all_requirements(
+            [self.base.files[path] for path in self.base.read],
+            partial(self.subject.earlier_robots, moves),
+            self.namespaces,
+            self.remaps,
+        )
+        required, system = self.head.requirements, self.subject.system
+        return moves.follow(self.base.requirements, moved, required, system)
+
+
+def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
+    """Return namespaces in which requirements that hold in ``/`` may be broken.
+
+    The first namespace is in no right, and stands for all other such namespaces. It is followed by
+    the namespaces in names that do not move with the namespace, and by namespaces that wildcards in
+    these names match; namespaces of added and removed rights come first.
+    """
+    enclaves = (*before.enclaves.values(), *after.enclaves.values())
+    placed = chain.from_iterable(map(placed_rights, enclaves))
+    fixed = {of.right.name for of in placed if of.written.startswith(("/", "*"))}
+    changed = {right.name for right in before.rights ^ after.rights}
+    names = sorted(fixed, key=lambda name: (name not in changed, name))
+    ordinary = "/any_namespace"
+    while any(ordinary in right.name for right in (*before.rights, *after.rights)):
+        ordinary += "_"
+    return [*dict.fromkeys([ordinary, *namespaces_in(names)])]
+
+
+class _Failure(NamedTuple):
+    """The failure of a requirement: uses that break it, or a text on why it protects nothing."""
+
+    uses: tuple[tuple[str, str, str, str], ...] = ()
+    """Enclaves, rights, names, and the wildcards that allow them ("" without wildcard)."""
+    others: frozenset[str] = frozenset()
+    """Further enclaves that break the requirement."""
+    worlds: tuple[str, ...] = ()
+    missing: str = ""
+    """An enclave that has to have rights, and does not exist."""
+    idle: bool = False
+    """Whether the enclave that has to have rights cannot start."""
+    text: str = ""
+
+    @property
+    def enclaves(self) -> frozenset[str]:
+        """All enclaves that break the requirement."""
+        return self.others.union(enclave for enclave, *_ in self.uses)
+
+    def with_new_names(self, names: Mapping[tuple[str, str], str]) -> _Failure:
+        """Return the same failure under new names, which are given by right and old name."""
+
+        def renamed(right: str, name: str) -> str:
+            for (of_right, old), new in names.items():
+                begin = old.removesuffix("*")
+                if right == of_right and (name == old or (begin != old and name.startswith(begin))):
+                    return new.removesuffix("*") + name.removeprefix(begin)
+            return name
+
+        uses = tuple(
+            (enclave, right, renamed(right, name), renamed(right, by))
+            for enclave, right, name, by in self.uses
+        )
+        new_names = {old: new for (_, old), new in names.items()}
+        text = _ABSOLUTE_NAME.sub(lambda match: new_names.get(match[0], match[0]), self.text)
+        return self._replace(uses=uses, text=text)
+
+
+_ABSOLUTE_NAME = re.compile(r"(?<!\S)(?<!enclave )/[^\s,;:()]*")
+
+
+def _failures(decided: Decisions, findings: Sequence[Finding]) -> dict[_Failure, Finding]:
+    """Return the findings which say that a requirement does not hold, or protects nothing."""
+    failures = {
+        _Failure(text=finding.text): finding for finding in findings if finding.kind is VACUOUS
+    }
+    broken = (finding for finding in findings if finding.kind is VIOLATED)
+    for violation, finding in zip(decided.violations, broken, strict=True):
+        steps = ((step.use, step.stated_form()[3]) for step in violation.steps)
+        uses = tuple((use.enclave, use.right, use.name, by) for use, by in steps)
+        others = {use.enclave for uses in violation.witness.others for use in uses}
+        why = violation.worlds, violation.missing, violation.idle
+        failures[_Failure(uses, frozenset(others), *why)] = finding
+    return failures
+
+
+@dataclass(frozen=True)
+class _Namespace:
+    """The requirements and worlds of BASE and HEAD in another namespace."""
+
+    earlier: Sequence[Requirement]
+    required: Sequence[Requirement]
+    before: Callable[[], System]
+    after: System
+
+    def findings(self, requirement: Requirement) -> Iterator[Finding]:
+        """Yield the findings on a requirement that are new in HEAD."""
+        broken = self._failures_after(requirement)
+        if not broken:
+            return
+        known = {*self._failures_before(requirement), *self._dropped_failures(requirement)}
+        if known.issuperset(broken):
+            return
+        if breaking := frozenset[str]().union(*(failure.enclaves for failure in known)):
+            broken = self._failures_after(requirement, breaking)
+        yield from (finding for failure, finding in broken.items() if failure not in known)
+
+    @cached_property
+    def _dropped(self) -> Sequence[DroppedRequirement]:
+        return dropped_requirements(self.earlier, self.required)
+
+    def _failures_before(self, requirement: Requirement) -> dict[_Failure, Finding]:
+        decided = decide_all([requirement], self.before())
+        return _failures(decided, decided_findings(decided, self.before()))
+
+    def _failures_after(
+        self, requirement: Requirement, breaking: frozenset[str] = frozenset()
+    ) -> dict[_Failure, Finding]:
+        """Return the failures of a requirement in HEAD.
+
+        A name that no right states counts only if a right of BASE states it; for `Nobody`, only if
+        the requirements of BASE forbid it already.  The place of a finding is a right of an enclave
+        that is not in ``breaking``, if such an enclave breaks the requirement.
+        """
+        decided = decide_all([requirement], self.after, breaking)
+        rights = self.before().rights if decided.unnamed else ()
+        return _failures(decided, decided_findings(decided, self.after, rights, self.earlier))
+
+    def _dropped_failures(self, requirement: Requirement) -> Iterator[_Failure]:
+        """Yield the failures in BASE of dropped requirements that have other names than this one.
+
+        The requirements are otherwise the same.  The failures have the names of ``requirement``.
+        """
+        for dropped in self._dropped:
+            if names := renamed_names(dropped.requirement, requirement):
+                failures = self._failures_before(dropped.requirement)
+                yield from (failure.with_new_names(names) for failure in failures)
