@@ -48,11 +48,12 @@ ALLOWED_BY_NAME = FindingKind(
     "requirement.allowed-by-name",
     NOTE,
     "access that a requirement allows to every enclave with such a name",
-    "The pattern of enclaves begins with a wildcard, so enclaves of any package can match it.",
+    "Only the pattern allows this: the list does not name these enclaves. Enclaves of any package "
+    "can have a name that the pattern matches.",
     "The requirements file.",
-    "If these enclaves are meant, ignore this finding. Otherwise, replace the pattern in the "
-    "requirement by the enclaves that are meant: `//operator/*` is only the robot's own "
-    "/operator/*, whatever the namespace.",
+    "If these enclaves are meant, ignore this finding. Otherwise, replace the pattern by the names "
+    "of the enclaves that are meant (for requirements of a package, in a copy): `//operator/panel` "
+    "is only /operator/panel, whatever the namespace.",
     prominent=True,
 )
 UNNAMED = FindingKind(

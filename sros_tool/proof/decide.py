@@ -121,7 +121,7 @@ class Verdict:
     the requirement that no right states, and that only wildcards match. ``unserved`` are clauses on
     services and actions that an enclave may use, and that nobody serves; ``unheard`` are clauses on
     topics of which enclaves have only the right in the requirement. ``by_name`` are uses that an
-    `Only` allows only by `patterns_of_any_package`.
+    `Only` allows only by `patterns_of_any_package` or by its ``unmoved`` patterns.
     """
 
     requirement: Requirement
@@ -382,8 +382,11 @@ def _uses_of_rights(
 
 
 def _uses_by_name(requirement: Only, world: World, limit: SearchLimit) -> Iterator[Use]:
-    """Yield a use of each enclave that only `patterns_of_any_package` allow."""
-    open_patterns = patterns_of_any_package(requirement)
+    """Yield a use of each enclave that is not in the list by its name, or by a pattern of its own.
+
+    Only `patterns_of_any_package` or ``unmoved`` patterns allow it.
+    """
+    open_patterns = {*patterns_of_any_package(requirement), *requirement.unmoved}
     if not open_patterns:
         return
     clear = [name for name in requirement.enclaves if name not in open_patterns]

@@ -224,7 +224,7 @@ def access_by_name_findings(
     gained = {right for right in old ^ new if _is_gained(right, new)}
     # As they were before: the change may also name its own enclaves in them.
     whole = {
-        _about_rights(requirement, gained): requirement
+        _about_rights(replace(requirement, unmoved=()), gained): requirement
         for requirement in earlier
         if isinstance(requirement, Only)
         and patterns_of_any_package(requirement)

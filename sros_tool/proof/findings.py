@@ -742,16 +742,26 @@ def _part_finding(
 
 
 def _by_name_findings(requirement: Only, steps: Iterable[Step]) -> Iterator[Finding]:
-    """Yield a finding on enclaves that a requirement allows only by a pattern for any package."""
+    """Yield findings on enclaves that a requirement allows only by a pattern for any package."""
     patterns = patterns_of_any_package(requirement)
-    # Without a namespace, the robot's own operators have a name that does not move.
-    unmoved = [name for name in patterns if name.startswith("/")]
-    steps = [step for step in steps if not any(covers(name, step.use.enclave) for name in unmoved)]
-    if not steps:
-        return
+    # Without a namespace, the robot's own enclaves have a name that does not move.
+    fixed = {*requirement.unmoved, *(name for name in patterns if name.startswith("/"))}
+    anywhere = [name for name in patterns if name not in fixed]
+    elsewhere, unmoved = [], []
+    for step in steps:
+        if not any(covers(name, step.use.enclave) for name in fixed):
+            elsewhere.append(step)
+        elif step.use.enclave not in requirement.enclaves:
+            unmoved.append(step)
+    if elsewhere:
+        yield _by_name_finding(requirement, anywhere, elsewhere)
+    if unmoved:
+        yield _by_name_finding(requirement, [f"/{name}" for name in requirement.unmoved], unmoved)
+
+
+def _by_name_finding(requirement: Only, patterns: Sequence[str], steps: Sequence[Step]) -> Finding:
     allowed = _listed_names([step.use.enclave for step in steps])
-    shown = first_few([name for name in patterns if name not in unmoved], 3)
-    text = f"{shown} allows this to {allowed}"
+    text = f"{first_few(patterns, 3)} allows this to {allowed}"
     related = [
         RelatedPlace(step.text(), step.source.file, step.source.line or None)
         for step in steps[:_MOST_SHOWN]
@@ -759,7 +769,7 @@ def _by_name_findings(requirement: Only, steps: Iterable[Step]) -> Iterator[Find
     ]
     place = requirement.source
     text += f"; required: {demand(requirement)}"
-    yield ALLOWED_BY_NAME.found(
+    return ALLOWED_BY_NAME.found(
         place.file, text, place.file, place.line, related=tuple(dict.fromkeys(related))
     )
 

@@ -126,11 +126,15 @@ class RightsRequirement(Requirement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Only(RightsRequirement):
-    """Only the listed ``enclaves`` may have any of the rights to any of the names."""
+    """Only the listed ``enclaves`` may have any of the rights to any of the names.
+
+    ``unmoved`` are the patterns among them that the file has with ``//`` at the beginning.
+    """
 
     KIND = "only"
 
     enclaves: tuple[str, ...]
+    unmoved: tuple[str, ...] = field(default=(), compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -835,7 +839,13 @@ def _filled_words(text: object, used_placeholders: Iterable[Placeholder], robot:
 
 def _only_from(table: _Table) -> Only:
     common = table.common_arguments(*KIND_OF, "enclaves")
-    return Only(**common, rights=table.rights(), enclaves=table.enclaves("enclaves"))
+    enclaves = table.enclaves("enclaves")
+    unmoved = tuple(
+        name[1:]
+        for name in table.texts("enclaves")
+        if name.startswith(_UNMOVED) and is_expression(name)
+    )
+    return Only(**common, rights=table.rights(), enclaves=enclaves, unmoved=unmoved)
 
 
 def _nobody_from(table: _Table) -> Nobody:

@@ -335,13 +335,18 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
     assert len(of_robot.vacuous) == 1 and not of_robot.holding_alone
 
 
+OWN = "//op/* allows this to /op/b"
+
+
 @pytest.mark.parametrize(
     ("listed", "allowed"),
     [
         ('"/a", "*/op/*"', ["*/op/* allows this to /op/b and /v/op/c"]),
-        ('"/a", "*/op/*", "//op/*", "!/x"', ["*/op/* allows this to /v/op/c"]),
-        ('"/a", "/op/*", "//v/*"', []),
-        ('"/a", "//op/*", "*/c"', ["*/c allows this to /v/op/c"]),
+        ('"/a", "*/op/*", "//op/*", "!/x"', ["*/op/* allows this to /v/op/c", OWN]),
+        ('"/a", "/op/*", "//v/*"', ["//v/* allows this to /v/op/c"]),
+        ('"/a", "//op/*", "*/c"', ["*/c allows this to /v/op/c", OWN]),
+        ('"/a", "//op/*", "/op/[b]", "*/c"', ["*/c allows this to /v/op/c"]),
+        ('"/a", "//op/*", "//op/b", "//v/op/c"', []),
         ('"*", "!/x"', []),
         ('"/*"', []),
     ],
@@ -349,9 +354,10 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
 def test_whom_a_pattern_for_any_package_allows_is_said(listed: str, allowed: list[str]) -> None:
     rights = {"/a": may("publish", "/x"), "/op/idle": may("subscribe", "/x")}
     rights |= {"/op/b": may("publish", "/*"), "/v/op/c": may("publish", "/x")}
-    for name in ("x", "/x"):
+    for name, namespaces in (("x", ()), ("/x", ()), ("x", ("/",))):
         required = f'[[only]]\npublish = ["{name}"]\nenclaves = [{listed}]'.encode()
-        findings = requirement_findings(parse_requirements(required, "r.toml"), robot(rights))
+        read = parse_requirements(required, "r.toml", namespaces=namespaces)
+        findings = requirement_findings(read, robot(rights))
         by_name = [each.text.partition("; ")[0] for each in findings if each.id == BY_NAME]
         assert by_name == allowed
 
