@@ -19,7 +19,7 @@ def checking(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figur
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.checks.kind import WARNING
-    from sros_tool.checks.policies import policy_file_findings
+    from sros_tool.checks.policies.policy import policy_file_findings
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.template import load_template

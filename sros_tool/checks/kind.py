@@ -11,7 +11,7 @@ from enum import StrEnum
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib import import_module
-from types import ModuleType
+from pkgutil import iter_modules
 from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
@@ -228,28 +228,30 @@ _MODULES = (
     *("keystores.issued", "keystores.trust", "keystores.zenoh_files", "zenoh", "upgrade"),
     *("environment", "runtime", "processes", "connections", "vulnerabilities", "review"),
 )
-"""The modules of checks, in the order in which their kinds are listed."""
+"""The modules and packages of checks, in the order in which their kinds are listed."""
 
 
-def _kinds_in(module: ModuleType) -> Iterator[FindingKind]:
-    """Yield the kinds that a module defines, as constants or as values of dictionaries."""
-    for value in vars(module).values():
-        for part in value.values() if isinstance(value, dict) else (value,):
-            if isinstance(part, FindingKind):
-                yield part
+def _kinds_in(name: str) -> list[FindingKind]:
+    """Return the kinds that a module, or the modules of a package, define, by id.
+
+    They are constants, or values of dictionaries.
+    """
+    module = import_module(name)
+    inner = (f"{name}.{part.name}" for part in iter_modules(getattr(module, "__path__", ())))
+    values = [
+        value for part in (module, *map(import_module, inner)) for value in vars(part).values()
+    ]
+    values += [part for value in values if isinstance(value, dict) for part in value.values()]
+    return sorted(
+        {value for value in values if isinstance(value, FindingKind)}, key=lambda kind: kind.id
+    )
 
 
 @cache
 def all_kinds() -> Mapping[str, FindingKind]:
     """Return all kinds of findings by id; imports all modules of checks."""
-    modules = [import_module(f"sros_tool.checks.{name}") for name in _MODULES]
-    return kinds_by_id(
-        *dict.fromkeys(
-            kind
-            for module in modules
-            for kind in sorted(_kinds_in(module), key=lambda kind: kind.id)
-        )
-    )
+    kinds = (kind for name in _MODULES for kind in _kinds_in(f"sros_tool.checks.{name}"))
+    return kinds_by_id(*dict.fromkeys(kinds))
 
 
 @dataclass(frozen=True, slots=True)

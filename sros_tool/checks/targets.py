@@ -92,7 +92,7 @@ def policy_findings(paths: Iterable[Path], circumstances: Circumstances) -> list
     Raises:
         DocumentError: there is no file at a path, or no policy in a folder.
     """
-    from sros_tool.checks.policies import policy_file_findings
+    from sros_tool.checks.policies.policy import policy_file_findings
 
     files = [file for path in paths for file in _policies_at(path)]
     findings = policy_file_findings(

@@ -380,7 +380,7 @@ def check(
         if decide:
             findings += decide(lambda paths: _load_system(paths, at, template))
     if template:
-        from sros_tool.checks.policies import is_mended_by  # most checks read no policy
+        from sros_tool.checks.policies.portability import is_mended_by  # most checks read no policy
         from sros_tool.keystore.template import load_template
 
         assumed = load_template(template)

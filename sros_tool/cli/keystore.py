@@ -321,13 +321,13 @@ def _show(
     root = result.root
     findings: list[tuple[Finding, ...]] = []
     if policies:
-        from sros_tool.checks.policies import signed_findings
+        from sros_tool.checks.policies.policy import signed_findings
 
         signed = {*result.created, *result.changed, *result.kept}
         findings = signed_findings(policies, signed, os.environ.get("ROS_DISTRO", ""))
     shown = None
     if as_json:
-        from sros_tool.checks.policies import as_note
+        from sros_tool.checks.policies.policy import as_note
 
         notes = [as_note(finding) for finding in findings]
         shown = json_form(result, "MadeEnclaves", notes=notes)

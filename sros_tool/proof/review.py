@@ -28,7 +28,7 @@ from sros_tool.checks.keystores.issued import (
 )
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
-from sros_tool.checks.policies import is_mended_by
+from sros_tool.checks.policies.portability import is_mended_by
 from sros_tool.checks.requirements import DROPPED
 from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError

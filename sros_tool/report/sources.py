@@ -233,7 +233,7 @@ def _read_source(
         text = "`sros check` does not check what was observed."
         return replace(source, findings=(*source.findings, _not_checked_finding(text)))
     from sros_tool.checks.keystores.opened import Circumstances
-    from sros_tool.checks.policies import policy_file_findings
+    from sros_tool.checks.policies.policy import policy_file_findings
     from sros_tool.checks.targets import path_findings
 
     at = Circumstances(

@@ -11,7 +11,7 @@ import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.opened import Circumstances
-from sros_tool.checks.policies import policy_file_findings
+from sros_tool.checks.policies.policy import policy_file_findings
 from sros_tool.errors import KeystoreError
 from sros_tool.files import policies_dir
 from sros_tool.keystore.reader import OpenedKeystore

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.kind import Finding
-from sros_tool.checks.policies import policy_file_findings
+from sros_tool.checks.policies.policy import policy_file_findings
 from sros_tool.files import policies_dir
 from sros_tool.spelling import NearNames
 from tests.checks.policy_cases import services, topics

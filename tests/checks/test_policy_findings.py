@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.kind import WARNING, Finding
-from sros_tool.checks.policies import policy_file_findings, signed_findings
+from sros_tool.checks.policies.policy import policy_file_findings, signed_findings
 from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot

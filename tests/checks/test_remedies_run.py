@@ -20,7 +20,7 @@ from sros_tool import cli
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import Finding, all_kinds
-from sros_tool.checks.policies import policy_file_findings
+from sros_tool.checks.policies.policy import policy_file_findings
 from sros_tool.checks.runtime import RuntimeState, runtime_findings
 from sros_tool.keystore.reader import OpenedKeystore
 from tests.checks import policy_cases, runtime_cases

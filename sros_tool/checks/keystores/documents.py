@@ -235,7 +235,7 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
     name, file = enclave.name, enclave.file("permissions.p7s")
     size = enclave.state.permissions_bytes
     if any(portability_problems(permissions, size, lambda names: Names(names).overlaps)):
-        from sros_tool.checks.policies import portability_findings
+        from sros_tool.checks.policies.portability import portability_findings
 
         yield from portability_findings(permissions, size, name, file)
     if len(permissions.grants) > 1:

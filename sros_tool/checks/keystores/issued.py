@@ -296,12 +296,12 @@ def check_issued(
     names = [summary.name for summary in summaries]
     pairs = [(inner, outer) for inner, outer in mistaken_names(names) if inner in plain]
     if pairs:
-        from sros_tool.checks.policies import ENCLAVE_NAMES
+        from sros_tool.checks.policies.portability import ENCLAVE_NAMES
 
         text = f"Cyclone DDS mistakes {pairs_text(pairs)}"
         yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
     if "/" in keystore.names:
-        from sros_tool.checks.policies import clause_on_enclaves_within_root
+        from sros_tool.checks.policies.enclaves import clause_on_enclaves_within_root
         from sros_tool.keystore.rights import load_rights
 
         if text := clause_on_enclaves_within_root(load_rights(keystore.opened).rights):

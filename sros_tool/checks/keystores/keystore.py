@@ -165,7 +165,8 @@ def keystore_findings(
     all_findings += check_capitals(topics)
     all_findings += zenoh_files.check_network(keystore, only_enclaves)
     if at.policies:
-        from sros_tool.checks.policies import findings_in, is_mended_by
+        from sros_tool.checks.policies.policy import findings_in
+        from sros_tool.checks.policies.portability import is_mended_by
 
         parts = [
             replace(
