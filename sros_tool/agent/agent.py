@@ -40,13 +40,14 @@ from sros_tool.agent.renewals import (
 )
 from sros_tool.agent.running import (
     EnclaveProcesses,
+    Restarts,
     Systemd,
     enclaves_to_restart,
     kernel_clock,
     look_at_processes,
     restart_units,
 )
-from sros_tool.agent.settings import AgentSettings, agent_folder
+from sros_tool.agent.settings import AgentSettings, Unit, agent_folder
 from sros_tool.agent.state import (
     CopiedKey,
     enclave_digests,
@@ -168,6 +169,12 @@ class Round(NamedTuple):
     """Enclaves of ``restart`` of which no process was seen, perhaps because some processes on this
     machine cannot be seen. Use ``--restarted`` to say that these restarts are done.
     """
+    restarted: Sequence[Unit]
+    """Units that the agent restarted in this round."""
+    waiting: Sequence[str]
+    """Enclaves of ``restart`` that wait: the agent restarts their units in the first round in which
+    the command of ``--restart-if`` exits with 0.
+    """
     requests: int
     """Number of signing requests in the message to the inbox."""
     sent: bool
@@ -216,6 +223,7 @@ class _Round:
         self._settings = settings
         self._machine = machine
         self._problems: list[str] = []
+        self._restarts = Restarts()
         self._state = read_state(folder)
         self._is_in_step = False
         """Whether the installed files, with their revocation list, are those of the last
@@ -270,12 +278,14 @@ class _Round:
             self._state.list_due, processes.list_states, complete=processes.complete
         )
         again = tuple(name for name in self._state.restarted if name in due)
+        waiting = {*_enclaves_of(self._restarts.waiting)}
         self._state = replace(
             self._state,
             due=due,
             unseen=unseen,
             list_due=list_due,
             restarted=again,
+            waiting=tuple(name for name in due if name in waiting),
             replaced=_moments_of(due, self._state.replaced),
             list_replaced=_moments_of(list_due, self._state.list_replaced),
         )
@@ -303,6 +313,8 @@ class _Round:
             installation.removed,
             self._state.due,
             self._state.unseen,
+            self._restarts.units,
+            self._state.waiting,
             len(asked.requests),
             arrived,
             self._sorted_problems(),
@@ -834,7 +846,7 @@ class _Round:
         ]
         # A process that may only claim to run in an enclave makes a restart due without new files.
         states, due = processes.restartable, self._state.replaced
-        done = restart_units(
+        done = self._restarts = restart_units(
             settings,
             [
                 name
@@ -850,9 +862,10 @@ class _Round:
             systemd=machine.systemd or Systemd(settings.systemctl),
         )
         self._problems += done.problems
-        restarted = tuple(sorted({*self._state.restarted, *done.enclaves}))
+        enclaves = _enclaves_of(done.units)
+        restarted = tuple(sorted({*self._state.restarted, *enclaves}))
         self._state = replace(self._state, restarted=restarted)
-        return [name for name in done.enclaves if states[name] is not RunningFiles.NOT_SEEN]
+        return [name for name in enclaves if states[name] is not RunningFiles.NOT_SEEN]
 
     def _examine_restarted(
         self, restarted: Sequence[str], names: Iterable[str]
@@ -1108,6 +1121,10 @@ class _Round:
                     ranked.append((name in own, validity_of(certificate).not_after, files))
         ranked.sort(key=lambda certificate: certificate[:2], reverse=True)
         return [files for *_, files in ranked[:_MOST_CERTIFICATES]]
+
+
+def _enclaves_of(units: Iterable[Unit]) -> tuple[str, ...]:
+    return tuple(name for unit in units for name in unit.enclaves)
 
 
 def _is_refusal(error: FetchError | RefusedError) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import subprocess
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, tzinfo
@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-from sros_tool.agent.settings import AgentSettings
+from sros_tool.agent.settings import AgentSettings, Unit
 from sros_tool.checks.kind import WARNING
 from sros_tool.checks.processes import (
     PROCESS_OUTDATED,
@@ -347,30 +347,27 @@ def _due_units(
     due_enclaves: Sequence[str],
     routers: Iterable[str],
     active: Iterable[str],
-) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield the units to restart and their enclaves, units of Zenoh routers first.
+) -> list[Unit]:
+    """Return the units to restart, units of Zenoh routers first.
 
     Then come the units of the settings, in their order, and the units of `sros units` in ``active``
     for enclaves without a unit in the settings.
     """
-    units = [
-        (unit.name, unit.enclaves)
-        for unit in settings.units
-        if set(unit.enclaves) & set(due_enclaves)
-    ]
-    named = {name for _, enclaves in units for name in enclaves}
+    units = [unit for unit in settings.units if set(unit.enclaves) & set(due_enclaves)]
+    named = {name for unit in units for name in unit.enclaves}
     known = set(active)
     for name in due_enclaves:
         if name not in named and (unit := f"sros@{unit_instance(name)}.service") in known:
-            units.append((unit, (name,)))
+            units.append(Unit(unit, (name,)))
     first = set(routers)
-    yield from sorted(units, key=lambda unit: not first & set(unit[1]))
+    return sorted(units, key=lambda unit: not first & set(unit.enclaves))
 
 
 class Restarts(NamedTuple):
-    """The enclaves whose units were restarted, and sentences on units that did not restart."""
+    """Units that were restarted, units that wait for ``restart_if``, and sentences on problems."""
 
-    enclaves: Sequence[str] = ()
+    units: Sequence[Unit] = ()
+    waiting: Sequence[Unit] = ()
     problems: Sequence[str] = ()
 
 
@@ -387,11 +384,17 @@ def restart_units(
     A unit of an enclave in ``unusable``, which maps names to reasons, is left running, because its
     processes would not start again.
     """
-    restarted: list[str] = []
+    restarted: list[Unit] = []
     problems: list[str] = []
     if not due_enclaves or not settings.restart:
         return Restarts()
-    if settings.restart_if:
+    try:
+        active = systemd.active_units()
+    except UnavailableError as error:
+        active = frozenset()
+        problems.append(str(error))
+    units = _due_units(settings, due_enclaves, routers, active)
+    if units and settings.restart_if:
         try:
             allowed = subprocess.run(
                 settings.restart_if,
@@ -403,23 +406,18 @@ def restart_units(
         except (OSError, subprocess.SubprocessError) as error:
             why = plain(str(error), 120)
             text = "No unit is restarted, because the command in `restart_if` did not start or end"
-            return Restarts((), (f"{text}: {why}.",))
+            return Restarts(problems=(*problems, f"{text}: {why}."))
         if allowed.returncode:
-            return Restarts()
-    try:
-        active = systemd.active_units()
-    except UnavailableError as error:
-        active = frozenset()
-        problems.append(str(error))
-    for unit, enclaves in _due_units(settings, due_enclaves, routers, active):
-        if broken := [name for name in enclaves if name in unusable]:
+            return Restarts(waiting=units, problems=problems)
+    for unit in units:
+        if broken := [name for name in unit.enclaves if name in unusable]:
             why = f"no process could start in {broken[0]}: {unusable[broken[0]]}"
-            problems.append(f"{unit} is not restarted: {why}.")
+            problems.append(f"{unit.name} is not restarted: {why}.")
             continue
         try:
-            systemd.restart(unit)
+            systemd.restart(unit.name)
         except UnavailableError as error:
             problems.append(str(error))
         else:
-            restarted += enclaves
-    return Restarts(tuple(restarted), tuple(problems))
+            restarted.append(unit)
+    return Restarts(restarted, problems=problems)

@@ -39,7 +39,9 @@ class Unit(NamedTuple):
     """A systemd unit, and the enclaves in which its processes run."""
 
     name: str
+    """Name of the unit, such as ``camera.service``."""
     enclaves: tuple[str, ...]
+    """Enclaves in which processes of the unit run."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,8 +82,9 @@ class AgentState:
     because a verified document became valid at that moment.  ``due`` are the enclaves whose
     processes were not yet seen with the installed files since the machine started; ``boot``
     identifies this start (see `boot_id`).  ``unseen`` are the enclaves in ``due`` of which no
-    process was seen.  ``restarted`` are the enclaves in ``due`` whose units were restarted after
-    their files changed.  ``list_due`` are the enclaves whose processes may lack the revocation
+    process was seen.  ``waiting`` are the enclaves in ``due`` whose units wait for ``restart_if``.
+    ``restarted`` are the enclaves in ``due`` whose units were restarted after their files changed.
+    ``list_due`` are the enclaves whose processes may lack the revocation
     list.  ``files`` maps enclaves to two digests at the end of the last round, as text: of all
     files, and of the files that decide whom the enclave trusts.  A change of a digest, whoever
     wrote the files, makes a restart due; ``list_since`` maps enclaves to the time since when the
@@ -103,6 +104,7 @@ class AgentState:
     due: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
     restarted: tuple[str, ...] = ()
+    waiting: tuple[str, ...] = ()
     list_due: tuple[str, ...] = ()
     boot: str = ""
     fetched: datetime | None = None
@@ -161,8 +163,8 @@ def _state_from(value: Any) -> AgentState:
         if value.get(moment) is not None:
             value[moment] = parse_iso(_checked_text(value[moment]))
     value["boot"] = _checked_text(value["boot"])
-    value = {"list_due": value["due"], "restarted": [], **value}
-    for names in ("due", "unseen", "restarted", "list_due"):
+    value = {"list_due": value["due"], "restarted": [], "waiting": [], **value}
+    for names in ("due", "unseen", "restarted", "waiting", "list_due"):
         value[names] = tuple(check_enclave_name(_checked_text(name)) for name in value[names])
     value["files"] = {
         check_enclave_name(_checked_text(name)): _checked_text(text)
@@ -402,6 +404,10 @@ class AgentStatus(NamedTuple):
     machine cannot be seen. Use ``sros agent run FOLDER --once --restarted`` to say that these
     restarts are done.
     """
+    waiting: Sequence[str]
+    """Enclaves of ``restart`` that wait: the agent restarts their units in the first round in which
+    the command of ``--restart-if`` exits with 0.
+    """
     problems: Sequence[str]
     """What the last round could not do, and what is wrong with the files now, as sentences."""
     well: bool
@@ -437,6 +443,7 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
         state.sent,
         state.due,
         state.unseen,
+        state.waiting,
         problems,
         recent and whole and not state.due and not problems,
     )

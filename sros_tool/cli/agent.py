@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -341,16 +341,23 @@ def _round_lines(folder: Path, finished_round: Round, *, restarted: bool) -> Ite
             "--restarted does not count for files that this round installed: files of "
             f"{first_few(finished_round.unseen, _MOST_SHOWN)}"
         )
-    yield from _due_lines(folder, finished_round.restart, finished_round.unseen)
+    for unit in finished_round.restarted:
+        yield f"restarted {unit.name} ({first_few(unit.enclaves, _MOST_SHOWN)})"
+    yield from _due_lines(folder, finished_round)
     if finished_round.requests:
         yield f"asked for renewal of {counted(finished_round.requests, 'enclave')}"
     yield "message sent" if finished_round.sent else "message not sent"
 
 
-def _due_lines(folder: Path, due_enclaves: Sequence[str], unseen: Sequence[str]) -> Iterator[str]:
-    if due_enclaves:
-        yield f"restart due: {first_few(due_enclaves, _MOST_SHOWN)}"
-    if unseen:
+def _due_lines(folder: Path, last: Round | AgentStatus) -> Iterator[str]:
+    if last.restart:
+        yield f"restart due: {first_few(last.restart, _MOST_SHOWN)}"
+    if last.waiting:
+        yield (
+            f"the agent itself restarts {first_few(last.waiting, _MOST_SHOWN)} in the first round "
+            "in which the command of --restart-if exits with 0"
+        )
+    if unseen := [name for name in last.unseen if name not in last.waiting]:
         yield (
             "sros cannot see all processes here; once the processes of "
             f"{first_few(unseen, _MOST_SHOWN)} were restarted, or if no such process runs, confirm "
@@ -401,7 +408,7 @@ def _status_lines(status: AgentStatus, moment: datetime) -> Iterator[str]:
     yield f"robot {status.robot}: {release}"
     yield f"source reached {_time_ago(status.fetched, moment)}: {status.source}"
     yield f"confirmed {_time_ago(status.sent, moment)} to {status.inbox}"
-    yield from _due_lines(status.folder, status.restart, status.unseen)
+    yield from _due_lines(status.folder, status)
     yield from status.problems
 
 

@@ -994,8 +994,9 @@ def test_units_restart_in_their_order(home: Home, r1: Robot) -> None:
     r1.release = home.revoked
     done = r1.round()
     assert r1.systemctl == ["a.service", "sros@r1-b.service"] and done.restart == ("/r1/c",)
+    assert done.restarted == [units[1], Unit("sros@r1-b.service", ("/r1/b",))]
     assert any("bad.service" in problem for problem in done.problems)
-    r1.round()
+    assert not r1.round().restarted
     assert r1.systemctl == ["a.service", "sros@r1-b.service"], "what is done is not done again"
 
 
@@ -1074,12 +1075,14 @@ def test_no_unit_restarts_that_could_not_start_or_must_not(home: Home, r1: Robot
     r1.round()
     r1.started = dict.fromkeys(NAMES, moment() - timedelta(hours=1))
     r1.release = home.revoked
-    assert r1.round().restart == NAMES and not r1.systemctl
+    done = r1.round()
+    assert done.restart == done.waiting == NAMES and not r1.systemctl
     (r1.folder / "enclaves/r1/a/key.pem").unlink()
     r1.settings = replace(r1.settings, restart_if=("true",))
     done = r1.round()
     assert r1.systemctl == ["c.service", "sros@r1-b.service"]
     assert any("a.service is not restarted" in problem for problem in done.problems)
+    assert not done.waiting
 
 
 def test_what_is_wrong_with_processes_is_confirmed(r1: Robot) -> None:

@@ -61,6 +61,8 @@ INIT = (
     *("agent", "init", "robot", "--robot", "r1", "--from", "pub", "--inbox", "inbox"),
     *("--root", "pub/metadata/1.root.json"),
 )
+UNIT = ("--restart", "--unit", "a.service=/r1/a", "--systemctl", "true")
+CLOSED = RunningProcesses((), (UnseenProcess(9, ("x",), "it is closed", uses_ros=False),))
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +89,11 @@ def world(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
 
 
 def test_from_home_to_the_robot_and_back(world: World) -> None:
+    world.monkeypatch.setattr(ProcessTable, "look", lambda *_: CLOSED)
     seen = Seen()
-    planned = world.run(*INIT, "--dry-run", "--json").ok()
+    planned = world.run(*INIT, *UNIT, "--dry-run", "--json").ok()
     assert not (world.folder / "robot/.agent").exists()
-    made = world.run(*INIT, "--json").ok()
+    made = world.run(*INIT, *UNIT, "--json").ok()
     assert json.loads(planned.out)["changes"] == json.loads(made.out)["changes"]
     again = world.run(*INIT)
     assert again.status == 2 and "already has an agent" in again.err
@@ -109,6 +112,7 @@ def test_from_home_to_the_robot_and_back(world: World) -> None:
     second = world.agent("--json").ok()
     seen.check("agent run", second)
     value = json.loads(second.out)
+    assert value["restarted"] == [{"name": "a.service", "enclaves": ["/r1/a"]}]
     assert value["changed"] == [*NAMES] and value["sent"] and not value["problems"]
     assert (world.folder / "robot/enclaves/r1/a/crl.pem").exists()
     assert world.collected()["outcome"] == "kept"
@@ -147,8 +151,7 @@ def test_renewal_without_anybody_at_the_robot(world: World) -> None:
 
 def test_what_is_said_restarted_has_no_files_of_the_same_round(world: World) -> None:
     """They came after the restart, so that its processes have the files of before."""
-    unseen = RunningProcesses((), (UnseenProcess(9, ("x",), "it is closed", uses_ros=False),))
-    world.monkeypatch.setattr(ProcessTable, "look", lambda *_: unseen)
+    world.monkeypatch.setattr(ProcessTable, "look", lambda *_: CLOSED)
     world.run(*INIT).ok()
     world.agent("--restarted").ok()
     world.run("renew", "ks", "/r1/a").ok()
@@ -156,6 +159,15 @@ def test_what_is_said_restarted_has_no_files_of_the_same_round(world: World) -> 
     early = world.agent("--restarted").ok().out
     assert "that this round installed: files of /r1/a\nrestart due: /r1/a\n" in early
     assert "restart" not in world.agent("--restarted").ok().out
+    world.run("renew", "ks", "/r1/a").ok()
+    world.run("fleet", "publish", "ks", "pub").ok()
+    waits = "the agent itself restarts /r1/a in the first round in which"
+    restarts = "\nrestarted a.service (/r1/a)\nrestart due: /r1/a\n"
+    for command, text in (("false", waits), ("true", restarts)):
+        world.run(*INIT, *UNIT, "--force", "--restart-if", command).ok()
+        assert text in world.agent().ok().out
+        shown = world.run("agent", "status", "robot")
+        assert shown.status == 1 and (waits in shown.out) == (text == waits)
 
 
 def test_a_robot_that_was_away_for_a_month_goes_on(world: World) -> None:
