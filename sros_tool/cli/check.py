@@ -525,7 +525,7 @@ def _load_system(
 def _suggested_requirements(paths: Iterable[Path], system: System) -> str:
     from sros_tool.proof.suggestions import render_requirements, suggest
 
-    proposed = suggest(system.rights, system.worlds, system.fleet())
+    proposed = suggest(system.rights, system.worlds, system.fleet(), is_keystore=system.is_keystore)
     return render_requirements(proposed.requirements, map(str, paths), proposed.comments)
 
 

@@ -14,10 +14,10 @@ from sros_tool.automata import SearchLimit
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import expression_problem, is_expression, moves_robot, only_reads
 from sros_tool.policy.model import PEER_RIGHT, RIGHTS, Level, Source
-from sros_tool.policy.patterns import matches
+from sros_tool.policy.patterns import matches, overlap
 from sros_tool.policy.placeholders import Placeholder
 from sros_tool.policy.rights import Right
-from sros_tool.proof.decide import MOST_STEPS, Worlds, influencers
+from sros_tool.proof.decide import MOST_STEPS, Verdict, Worlds, influencers
 from sros_tool.proof.requirements import (
     EXCEPT,
     Apart,
@@ -56,12 +56,17 @@ class Suggestions(NamedTuple):
 
 
 def suggest(
-    rights: Iterable[Right], worlds: Sequence[World], fleet: Fleet | None = None
+    rights: Iterable[Right],
+    worlds: Sequence[World],
+    fleet: Fleet | None = None,
+    *,
+    is_keystore: bool = False,
 ) -> Suggestions:
     """Return proposals of requirements that hold in all worlds, from the allowed ``rights``.
 
-    Proposals and comments that apply to all robots of ``fleet``, or of a group, are written once,
-    with placeholders.
+    A requirement that `sros check` would call vacuous, in a keystore or else in a policy, is not
+    proposed.  Proposals and comments that apply to all robots of ``fleet``, or of a group, are
+    written once, with placeholders.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
@@ -72,7 +77,10 @@ def suggest(
     most = _MAX_CANDIDATES * min(len(fleet.robots) if fleet else 1, _MAX_ROBOTS)
     for requirement in islice(_candidates(stated, worlds), most):
         verdicts = all_worlds.decide(requirement, limit)
-        if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
+        if not any(
+            verdict.witness or _is_vacuous(verdict, is_keystore=is_keystore)
+            for _, verdict in verdicts
+        ):
             last = _joined_requirement(requirements[-1], requirement) if requirements else None
             requirements[-1:] = [last] if last else [*requirements[-1:], requirement]
     missing: Iterable[Requirement] = _unreserved_moves(stated, requirements)
@@ -80,6 +88,13 @@ def suggest(
         missing = _with_placeholders_for_robots(missing, fleet)
         requirements = [*_with_placeholders_for_robots(requirements, fleet)]
     return Suggestions(requirements, [_comment_on_unmet(each) for each in missing])
+
+
+def _is_vacuous(verdict: Verdict, *, is_keystore: bool) -> bool:
+    """Return whether a requirement with absolute names protects less than it states."""
+    of_topics = verdict.unheard if is_keystore else ()
+    clauses = (*verdict.empty, *verdict.waiting, *verdict.gone, *verdict.unserved, *of_topics)
+    return bool(verdict.always or clauses)
 
 
 def names_to_protect(rights: Iterable[Right]) -> set[str]:
@@ -118,7 +133,7 @@ def _comment_on_unmet(requirement: Requirement) -> str:
     (right, (name,)), users = requirement.rights[0], counted(len(requirement.enclaves), "enclave")
     return (
         f"# not proposed: that only some enclaves may {right} {name} (stated for {users}, but "
-        "others may do so by a wildcard, or a DENY applies)"
+        "others may do so by a wildcard, a DENY applies, or nobody has the other side)"
     )
 
 
@@ -142,10 +157,12 @@ class _StatedRights:
         self.users: dict[tuple[str, str], set[str]] = defaultdict(set)
         self.wild: dict[str, set[str]] = defaultdict(set)
         self.people: set[str] = set()  # the enclaves of people that may change nodes
+        self.requests_of_people: set[str] = set()
         for right in rights:
             is_of_people = matches(_ENCLAVES_OF_PEOPLE, right.enclave)
             if is_of_people and right.right == "request" and not only_reads(right.name):
                 self.people.add(right.enclave)
+                self.requests_of_people.add(right.name)
             if right.kind == "dds" or expression_problem(right.name):
                 continue  # permissions that others wrote may have any text
             if is_expression(right.name):
@@ -177,8 +194,12 @@ class _StatedRights:
             and ("request", name) not in self.users
             and self.users["reply", name] & partners
         }
-        people = {_ENCLAVES_OF_PEOPLE} if self.people else set()
-        users = {service: set(people) for service in unused}
+        users = {
+            service: {_ENCLAVES_OF_PEOPLE}
+            for service in unused
+            if any(overlap(name, f"*/{service}") for name in self.requests_of_people)
+        }
+        users |= {service: set() for service in unused - users.keys()}
         for (right, name), enclaves in self.users.items():
             if right == "request" and (service := name.rpartition("/")[2]) in unused:
                 users[service] |= enclaves - self.people
@@ -216,20 +237,20 @@ def _requirements_on_few_holders(stated_rights: _StatedRights, right: str) -> It
     """Yield a requirement for each group of up to three enclaves that are the only users of names.
 
     Services that only read get their own requirement, so that an exception for them does not allow
-    changes, too.  Names that move the robot get a requirement for any number of enclaves, even
-    without a known receiver.  Services for which `_requirements_on_changing_services` states the
-    same users are left out.
+    changes, too, and so do names without a known receiver, as these may not be proposed.  Names
+    that move the robot get a requirement for any number of enclaves, even without a known receiver.
+    Services for which `_requirements_on_changing_services` states the same users are left out.
     """
     other = PEER_RIGHT[right]
-    names: dict[tuple[tuple[str, ...], bool], list[str]] = defaultdict(list)
+    names: dict[tuple[tuple[str, ...], bool, bool], list[str]] = defaultdict(list)
     users_elsewhere = stated_rights.changing_services if right == "request" else {}
     for name in stated_rights.names(right):
         users = tuple(sorted(stated_rights.users[right, name]))
         received = name not in _OF_EVERY_NODE and (other, name) in stated_rights.users
         is_covered = users_elsewhere.get(name.rpartition("/")[2]) == users
         if not is_covered and (moves_robot(name) or (len(users) <= _MAX_HOLDERS and received)):
-            names[users, only_reads(name)].append(name)
-    for (enclaves, _), names_held in sorted(
+            names[users, only_reads(name), not received].append(name)
+    for (enclaves, *_), names_held in sorted(
         names.items(), key=lambda item: (len(item[0][0]), item[0])
     ):
         yield Only(source=_NOWHERE, rights=((right, tuple(names_held)),), enclaves=enclaves)

@@ -621,12 +621,30 @@ def test_whom_nobody_reaches_needs_no_search(monkeypatch: pytest.MonkeyPatch) ->
     assert not any(decisions.decide(gate, world).witness for world in system.worlds)
 
 
-def test_what_is_proposed_can_fail() -> None:
-    two = {"/a": may("publish", "/x", "/*"), "/b": may("subscribe", "/x")}
-    system = robot(two)
-    proposed = suggest(system.rights, system.worlds).requirements
-    assert {type(each) for each in proposed} >= {Only, Protected}
-    assert decide_all(proposed, system).vacuous == ()
+_SERVER = may("publish", "/x") + may("reply", "/arm/open", "/arm/set_parameters")
+_NOT_PARAMETERS = {"/arm": _SERVER, "/operator/panel": may("request", "/arm/open")}
+
+
+@pytest.mark.parametrize("is_keystore", [False, True])
+@pytest.mark.parametrize(
+    ("more", "kind"),
+    [
+        ({"/a": may("publish", "/x", "/*")}, Only),
+        # The operator's panel changes no parameters, so nobody does.
+        (_NOT_PARAMETERS, Nobody),
+        # Nobody listens, and nobody executes.
+        ({"/a": may("publish", "/x", "/cmd_vel")}, Only),
+        ({"/a": may("publish", "/x") + may("call", "/follow_joint_trajectory")}, Only),
+    ],
+)
+def test_what_is_proposed_can_fail(
+    more: dict[str, str], kind: type[Requirement], is_keystore: bool
+) -> None:
+    system = replace(robot({**more, "/b": may("subscribe", "/x")}), is_keystore=is_keystore)
+    proposed = suggest(system.rights, system.worlds, is_keystore=is_keystore).requirements
+    assert {type(each) for each in proposed} >= {kind, Protected}
+    required = parse_requirements(render_requirements(proposed, ["robot.xml"]).encode(), "r.toml")
+    assert VACUOUS not in {finding.id for finding in requirement_findings(required, system)}
 
 
 def test_who_moves_the_robot_is_proposed_for_any_number() -> None:
@@ -642,7 +660,7 @@ def test_who_moves_the_robot_is_proposed_for_any_number() -> None:
     wide = robot({**drivers, **base, "/look": may("publish", "/*")})
     assert suggest(wide.rights, wide.worlds).comments == [
         "# not proposed: that only some enclaves may publish /cmd_vel (stated for 5 enclaves, "
-        "but others may do so by a wildcard, or a DENY applies)"
+        "but others may do so by a wildcard, a DENY applies, or nobody has the other side)"
     ]
 
 

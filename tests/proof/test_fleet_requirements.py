@@ -179,7 +179,8 @@ def test_what_is_not_proposed_for_a_fleet_is_said_once(folder: Path) -> None:
     suggested = sros("check", "robot.xml", "--fleet", "fleet.toml", "--suggest", cwd=folder).ok()
     assert [line for line in suggested.out.splitlines() if line.startswith("# not")] == [
         "# not proposed: that only some enclaves may publish {namespace:carriers}/cmd_vel "
-        "(stated for 1 enclave, but others may do so by a wildcard, or a DENY applies)"
+        "(stated for 1 enclave, but others may do so by a wildcard, a DENY applies, or nobody has "
+        "the other side)"
     ]
 
 
