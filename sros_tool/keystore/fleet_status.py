@@ -36,6 +36,7 @@ from sros_tool.keystore.confirmation import (
     OF_OTHER_CA,
     Confirmation,
     ReceivedConfirmation,
+    RefusedMessage,
     RobotClock,
     RobotDds,
     RunningFiles,
@@ -1405,146 +1406,271 @@ class _KeystoreRecords:
         return State.EARLIER, entry.time, ""
 
 
+@dataclass(frozen=True)
+class _RobotFacts:
+    """What the last confirmation of a robot shows, together with the keystore's records."""
+
+    compared: _ComparedRobot
+    records: _KeystoreRecords
+
+    @property
+    def name(self) -> str:
+        return self.compared.robot.name
+
+    @property
+    def has_enclaves(self) -> bool:
+        """Whether the keystore has enclaves of the robot."""
+        return bool(self.compared.enclaves)
+
+    @property
+    def received(self) -> ReceivedConfirmation | None:
+        return self.compared.received
+
+    @property
+    def confirmed(self) -> Confirmation | None:
+        return self.compared.confirmed
+
+    # ── its state ──────────────────────────────────────────────────────────────────────────
+
+    @cached_property
+    def different(self) -> tuple[ConfirmedFile, ...]:
+        """The files that differ from the keystore."""
+        return tuple(
+            self.records.file(self.compared.robot, file) for file in self.compared.different
+        )
+
+    @cached_property
+    def revoked(self) -> tuple[str, ...]:
+        """The revoked enclaves that are no longer in the keystore."""
+        return self.records.revoked_enclaves(self.compared.robot)
+
+    def files(self) -> dict[str, Mapping[State, int]]:
+        """Return the number of files by kind and state."""
+        counts = {
+            kind: Counter({State.CURRENT: number}) for kind, number in self.compared.current.items()
+        }
+        for file in self.different:
+            counts.setdefault(file.kind, Counter())[file.state] += 1
+        return {
+            kind: counts[kind] for kind in (*_KINDS_BY_FILE.values(), _ZENOH_KIND) if kind in counts
+        }
+
+    @cached_property
+    def state(self) -> State:
+        """The worst state of the files, or another reason why the robot is not current."""
+        states = [self._state_of_files()]
+        if self.has_enclaves and any(map(is_unusable, self.reported)):
+            states.append(State.UNUSABLE)
+        if self.is_later:
+            states.append(State.LATER)
+        if self.refusal:
+            states.append(State.REFUSED)
+        return max(states, key=_RANK_OF_STATE.__getitem__)
+
+    def _state_of_files(self) -> State:
+        if self.revoked and not self.has_enclaves:
+            return State.REVOKED  # such a robot should have no files, whatever it reports
+        if self.different:
+            return max((file.state for file in self.different), key=_RANK_OF_STATE.__getitem__)
+        if not self.has_enclaves:
+            return State.NONE
+        if self.received is None:
+            return State.NEVER
+        return State.RESTART if self.compared.restart() else State.CURRENT
+
+    @cached_property
+    def is_later(self) -> bool:
+        """Whether the robot reports a later release than was ever published for it."""
+        return bool(
+            self.has_enclaves
+            and self.confirmed
+            and self.records.is_later(self.name, self.confirmed.release or 0)
+        )
+
+    @cached_property
+    def refusal(self) -> RefusedMessage | None:
+        """The refusal of the robot's last message; None if the message was accepted."""
+        refusal = self.records.refusals.get(self.name) if self.has_enclaves else None
+        is_last = refusal and (self.received is None or self.received.time <= refusal.time)
+        return refusal if is_last else None
+
+    @cached_property
+    def is_ahead(self) -> bool:
+        """Whether the files are newer than the backup of the keystore, by the robot's message."""
+        return bool(
+            self.state is State.UNKNOWN
+            and self.received
+            and self.received.message
+            and self.records.is_ahead(self.received.confirmation)
+        )
+
+    @cached_property
+    def is_doubtful(self) -> bool:
+        """Whether the files are not known, in addition to the state that is shown."""
+        return bool(self.refusal or self.is_later or self.two_computers)
+
+    # ── what it reports, and what its messages show ────────────────────────────────────────
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """The problems in the robot's own words."""
+        return (self.confirmed and self.confirmed.problems) or ()
+
+    @cached_property
+    def two_computers(self) -> str:
+        """A sentence if two computers seem to have the keys of the robot, or ""."""
+        if not (self.has_enclaves and self.received and self.received.is_alternation_shown):
+            return ""
+        return self.received.two_computers_sentence(
+            was_restored=self.records.was_restored,
+            makes_keys=self.records.makes_keys(self.compared),
+        )
+
+    @property
+    def fetches(self) -> bool:
+        """Whether the robot fetches its files."""
+        return bool(self.received and self.received.message)
+
+    @cached_property
+    def got_earlier_release(self) -> bool:
+        """Whether the robot fetched after a publication, and got an earlier release."""
+        received, confirmed = self.received, self.confirmed
+        confirmed_at = min(received.time, confirmed.time) if received and confirmed else None
+        return self.fetches and self.records.got_earlier_release(self.compared, confirmed_at)
+
+    def problems(self) -> tuple[str, ...] | None:
+        """Return the reported problems, and those that the messages show; None if not reported."""
+        problems = self.confirmed.problems if self.confirmed else None
+        if self.two_computers:
+            problems = (*self.reported, self.two_computers)
+        if problems or not (self.got_earlier_release and self.confirmed):
+            return problems
+        release = self.confirmed.release
+        has = f"release {release}" if release else "no release"
+        return (
+            f"It sent a message long after release {self.records.published.get(self.name)} was "
+            f"published, and has {has}: the place that `from` names in the settings of its agent "
+            "has an old copy.",
+        )
+
+    def notes(self) -> Iterator[str]:
+        """Yield the remarks about the robot."""
+        if restored := self._restored_clause():
+            yield restored
+        yield from self.compared.notes
+        if self.refusal:
+            since = iso(self.refusal.time)
+            yield f"its last message has been refused since {since}: {self.refusal.why}"
+        if self.is_ahead and self.confirmed:
+            yield (
+                f"it says that it has release {self.confirmed.release}, from after the backup of "
+                "the keystore: its files are then newer than the keystore's, and the next release "
+                "replaces them"
+            )
+
+    def _restored_clause(self) -> str:
+        """Return a clause if a restored keystore lacks what the robot has, or ""."""
+        why = self.refusal.why if self.refusal and self.state is State.REFUSED else ""
+        is_lost = why.startswith(NOT_IN_LEDGER)
+        is_unknown = self.state is State.UNKNOWN and not self.is_ahead
+        if not ((is_lost or is_unknown) and self.records.is_restored):
+            return ""
+        root = self.records.root
+        others = sorted(self.records.enclaves_with_other_keys.intersection(self.compared.enclaves))
+        if others:
+            return (
+                f"the keystore was restored, and made another key for {', '.join(others)} than the "
+                f"robot has. {other_keys_remedy(root, others).removesuffix('.')}"
+            )
+        return (
+            "the keystore was restored, and lacks what it issued after the backup. If the message "
+            f"is genuine, run `sros distribute_key {quote(str(root))} --robot NAME FOLDER --force`"
+        )
+
+    # ── what it has, and what is in force ──────────────────────────────────────────────────
+
+    @cached_property
+    def has_authorities(self) -> bool:
+        """Whether the robot has the current identity CA in all of its enclaves."""
+        return (
+            not self.is_doubtful
+            and self.has_enclaves
+            and self.received is not None
+            and self.compared.has_current_files("identity_ca")
+        )
+
+    @cached_property
+    def has_list(self) -> bool:
+        """Whether the robot has the current revocation list, or an equal one."""
+        return (
+            self.records.has_list
+            and self.has_authorities
+            and self.compared.has_current_files("crl", self.records.is_list_equal)
+        )
+
+    @property
+    def is_restarted(self) -> bool:
+        """Whether no process runs with another list or with earlier CAs."""
+        return self.compared.crl_restart() == ()
+
+    @cached_property
+    def has_release(self) -> bool:
+        """Whether the last release has the current files, which the robot lacks."""
+        return bool(self.different) and self.records.has_release(self.compared)
+
+    def enclaves_lacking_key(self) -> tuple[str, ...]:
+        """Return the enclaves whose key is in the keystore but not on the robot."""
+        if not (self.different or self.state is State.UNUSABLE):
+            return ()
+        return self.records.enclaves_lacking_key(self.compared)
+
+
 def _robot_status(
     compared_robot: _ComparedRobot,
     records: _KeystoreRecords,
     stages: _Stages,
     unrecorded: UnrecordedEnclaves,
 ) -> RobotStatus:
-    different = tuple(records.file(compared_robot.robot, file) for file in compared_robot.different)
-    revoked = records.revoked_enclaves(compared_robot.robot)
-    counts: dict[str, Counter[State]] = {}
-    for kind, number in compared_robot.current.items():
-        counts.setdefault(kind, Counter())[State.CURRENT] = number
-    for file in different:
-        counts.setdefault(file.kind, Counter())[file.state] += 1
-    restart = compared_robot.restart()
-    if revoked and not compared_robot.enclaves:
-        state = State.REVOKED  # such a robot should have no files, whatever it reports
-    elif different:
-        state = max((file.state for file in different), key=_RANK_OF_STATE.__getitem__)
-    elif not compared_robot.enclaves:
-        state = State.NONE
-    elif compared_robot.received is None:
-        state = State.NEVER
-    else:
-        state = State.RESTART if restart else State.CURRENT
-    received, confirmed = compared_robot.received, compared_robot.confirmed
-    notes = [*compared_robot.notes]
-    if compared_robot.enclaves and any(map(is_unusable, (confirmed and confirmed.problems) or ())):
-        state = max(state, State.UNUSABLE, key=_RANK_OF_STATE.__getitem__)
-    is_later = bool(
-        compared_robot.enclaves
-        and confirmed
-        and records.is_later(compared_robot.robot.name, confirmed.release or 0)
-    )
-    if is_later:
-        state = max(state, State.LATER, key=_RANK_OF_STATE.__getitem__)
-    refusal = records.refusals.get(compared_robot.robot.name) if compared_robot.enclaves else None
-    is_refused = bool(refusal and (received is None or received.time <= refusal.time))
-    if refusal and is_refused:
-        state = max(state, State.REFUSED, key=_RANK_OF_STATE.__getitem__)
-        since = iso(refusal.time)
-        notes.append(f"its last message has been refused since {since}: {refusal.why}")
-    is_ahead = bool(
-        state is State.UNKNOWN
-        and received
-        and received.message
-        and records.is_ahead(received.confirmation)
-    )
-    if is_ahead and confirmed:
-        notes.append(
-            f"it says that it has release {confirmed.release}, from after the backup of the "
-            "keystore: its files are then newer than the keystore's, and the next release replaces "
-            "them"
-        )
-    is_lost = state is State.REFUSED and refusal and refusal.why.startswith(NOT_IN_LEDGER)
-    if (is_lost or (state is State.UNKNOWN and not is_ahead)) and records.is_restored:
-        others = sorted(records.enclaves_with_other_keys.intersection(compared_robot.enclaves))
-        remedy = (
-            f"made another key for {', '.join(others)} than the robot has. "
-            + other_keys_remedy(records.root, others).removesuffix(".")
-            if others
-            else "lacks what it issued after the backup. If the message is genuine, run `sros "
-            f"distribute_key {quote(str(records.root))} --robot NAME FOLDER --force`"
-        )
-        notes.insert(0, f"the keystore was restored, and {remedy}")
-    problems = confirmed.problems if confirmed else None
-    if (
-        two_computers := received.two_computers_sentence(
-            was_restored=records.was_restored, makes_keys=records.makes_keys(compared_robot)
-        )
-        if received and received.is_alternation_shown and compared_robot.enclaves
-        else ""
-    ):
-        problems = (*(problems or ()), two_computers)
-    # In addition to the state that is shown.
-    is_doubtful = bool(is_refused or is_later or two_computers)
-    has_authorities = (
-        not is_doubtful
-        and bool(compared_robot.enclaves)
-        and received is not None
-        and compared_robot.has_current_files("identity_ca")
-    )
-    has_list = (
-        records.has_list
-        and has_authorities
-        and compared_robot.has_current_files("crl", records.is_list_equal)
-    )
-    is_restarted = compared_robot.crl_restart() == ()
-    fetches = bool(received and received.message)
-    has_release = bool(different) and records.has_release(compared_robot)
+    facts = _RobotFacts(compared_robot, records)
+    received, confirmed = facts.received, facts.confirmed
     validity = records.first_expiring(compared_robot)
-    status = RobotStatus(
-        compared_robot.robot.name,
-        state,
-        len(compared_robot.enclaves),
-        revoked,
-        unrecorded,
-        received.time if received else None,
-        confirmed.time if confirmed else None,
-        fetches,
-        confirmed.release if confirmed else None,
-        records.published.get(compared_robot.robot.name),
-        stages.stage_of(compared_robot),
-        {kind: counts[kind] for kind in (*_KINDS_BY_FILE.values(), _ZENOH_KIND) if kind in counts},
-        different,
-        restart,
-        compared_robot.running(),
-        has_list and is_restarted if records.has_list and compared_robot.enclaves else None,
-        {kind: file.window.not_after for kind, file in validity.items()},
-        confirmed.dds if confirmed else None,
-        problems,
-        tuple(notes),
-        has_release=has_release,
-        lacks_ca=fetches and records.lacks_ca(compared_robot, is_published=has_release),
+    renewals = (file.window.expires_soon_from() for file in validity.values())
+    needs_list = records.has_list and facts.has_enclaves
+    return RobotStatus(
+        robot=facts.name,
+        state=facts.state,
+        enclaves=len(compared_robot.enclaves),
+        revoked=facts.revoked,
+        others=unrecorded,
+        received=received.time if received else None,
+        clock=confirmed.time if confirmed else None,
+        fetches=facts.fetches,
+        release=confirmed.release if confirmed else None,
+        published=records.published.get(facts.name),
+        stage=stages.stage_of(compared_robot),
+        files=facts.files(),
+        pending=facts.different,
+        restart=compared_robot.restart(),
+        running=compared_robot.running(),
+        crl_in_force=facts.has_list and facts.is_restarted if needs_list else None,
+        expiry={kind: file.window.not_after for kind, file in validity.items()},
+        dds=confirmed.dds if confirmed else None,
+        problems=facts.problems(),
+        notes=tuple(facts.notes()),
+        has_release=facts.has_release,
         short_lived=records.short_lived(validity),
-        has_list=has_list,
-        is_doubtful=is_doubtful,
-        has_shared_keys=bool(two_computers),
-        may_trust_replaced=not (has_authorities and is_restarted),
-        renew_from=min(
-            (file.window.expires_soon_from() for file in validity.values()), default=None
-        ),
-        lacks_key=records.enclaves_lacking_key(compared_robot)
-        if different or state is State.UNUSABLE
-        else (),
-        is_ahead=is_ahead,
-        reported=len((confirmed and confirmed.problems) or ()),
+        has_list=facts.has_list,
+        is_doubtful=facts.is_doubtful,
+        has_shared_keys=bool(facts.two_computers),
+        may_trust_replaced=not (facts.has_authorities and facts.is_restarted),
+        renew_from=min(renewals, default=None),
+        lacks_key=facts.enclaves_lacking_key(),
+        got_earlier_release=facts.got_earlier_release,
+        is_ahead=facts.is_ahead,
+        locked_out_from=records.locked_out_from(compared_robot) if facts.fetches else None,
+        lacks_ca=facts.fetches and records.lacks_ca(compared_robot, is_published=facts.has_release),
+        reported=len(facts.reported),
         is_behind=bool(confirmed and confirmed.clock is RobotClock.BEHIND),
-        locked_out_from=records.locked_out_from(compared_robot) if fetches else None,
-    )
-    if not (status.fetches and records.got_earlier_release(compared_robot, status.confirmed)):
-        return status
-    if status.problems:
-        return replace(status, got_earlier_release=True)
-    has = f"release {status.release}" if status.release else "no release"
-    copy_problem = (
-        f"It sent a message long after release {status.published} was published, and has {has}: "
-        "the place that `from` names in the settings of its agent has an old copy."
-    )
-    return replace(
-        status, got_earlier_release=True, problems=(*(status.problems or ()), copy_problem)
     )
 
 
