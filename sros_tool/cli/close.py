@@ -347,8 +347,8 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         sign = signs.get(process.known_by, f"by its {process.known_by}")
         state = f"process {process.pid}" + ("" if runs else f", known {sign}")
     elif runs:
-        state = "was started by a new command; sros keeps the observed command (to replace the "
-        state += "observed command, watch the open robot again)"
+        state = "was started by a new command; sros keeps the observed one: start it by that again "
+        state += f"({closed.folder / 'start/commands.txt'}), or watch the open robot again"
     else:
         ended = process.enclave in closed.observed.ended
         state = "has ended" if ended else "no process runs its command"

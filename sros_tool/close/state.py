@@ -324,7 +324,7 @@ class RunningRobot:
             if self.may_use_files(process):
                 running.setdefault(enclave.name, []).append(process)
         as_started = [
-            self._with_own_unit(_with_running_command(process, processes), processes)
+            self._with_own_unit(self._with_running_command(process, processes), processes)
             if known[process.enclave] == 1
             else process
             for process in observed.processes
@@ -339,6 +339,28 @@ class RunningRobot:
         ]
         return observed._replace(processes=[*as_started, *later])
 
+    def _with_running_command(
+        self, observed: ClosedProcess, running: Sequence[Process]
+    ) -> ClosedProcess:
+        """Return an observed process with the command of the only program in its enclave.
+
+        Programs of `ros2` and sros do not count. If a launch, a container or another process starts
+        the observed process, its command does not change; nor does it if the process left its unit
+        for none of its own, or if the program runs without the argument for its enclave.
+        """
+        started_by = observed.launch or observed.container or observed.shares
+        programs = {process.program: process for process in running}
+        if started_by or len(programs) != 1 or any(map(observed.fits, running)):
+            return observed
+        (process,) = programs.values()
+        now = secured_process(process, observed.enclave)
+        if now.launch or now.container or _is_tool(process):
+            return observed
+        has_left = now.unit != observed.unit and not self._own_unit(process)
+        if observed.unit and (has_left or now.lacks_enclave_argument):
+            return observed
+        return observed._replace(command=now.command, folder=now.folder, rmw=now.rmw, user=now.user)
+
     def _with_own_unit(self, known: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
         """Return a process with its unit, if the unit starts only this process, in its enclave.
 
@@ -348,17 +370,23 @@ class RunningRobot:
         if known.launch or known.container or known.shares or len(programs) != 1:
             return known
         ((pid, process),) = programs.items()
-        origin = process_origin(pid)
-        unit = origin.unit
-        is_alone = self._programs_of_units[unit] == 1 and not (origin.launch or origin.container)
+        unit = process_origin(pid).unit
         needs_drop_in = (SYSTEMD_FOLDER / f"{unit}.d" / DROP_IN).exists()
         if unit == known.unit:
             return known._replace(secured_by_unit=known.secured_by_unit and not needs_drop_in)
-        # With another strategy, a restart would not help.
-        if unit and is_alone and process.environment.get(STRATEGY) == "Enforce":
+        if self._own_unit(process):
             known = known._replace(user=process.user)
             return known._replace(unit=unit, secured_by_unit=not needs_drop_in)
         return known._replace(unit="", secured_by_unit=False) if known.secured_by_unit else known
+
+    def _own_unit(self, process: Process) -> str:
+        """Return the unit that starts only this process, with security; "" without such a unit."""
+        origin = process_origin(process.program[0])
+        is_alone = self._programs_of_units[origin.unit] == 1
+        # With another strategy, a restart would not help.
+        is_secured = process.environment.get(STRATEGY) == "Enforce"
+        by_itself = is_alone and is_secured and not (origin.launch or origin.container)
+        return origin.unit if by_itself else ""
 
     @cached_property
     def _programs_of_units(self) -> Mapping[str, int]:
@@ -489,26 +517,6 @@ def _enclaves_of(
         if program in {programs.get(enclave), *(name.rpartition("/")[2] for name in names)}
     ]
     return fitting, "program"
-
-
-def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
-    """Return an observed process with the command of the only program that runs in its enclave.
-
-    Programs of `ros2` and sros do not count. If a launch, a container or another process starts the
-    observed process, its command does not change; nor does it if the process left its unit, or if
-    the program runs without the argument for its enclave.
-    """
-    started_by = observed.launch or observed.container or observed.shares
-    programs = {process.program: process for process in running}
-    if started_by or len(programs) != 1 or any(map(observed.fits, running)):
-        return observed
-    (process,) = programs.values()
-    now = secured_process(process, observed.enclave)
-    if now.launch or now.container or _is_tool(process):
-        return observed
-    if observed.unit and (now.unit != observed.unit or now.lacks_enclave_argument):
-        return observed
-    return observed._replace(command=now.command, folder=now.folder, rmw=now.rmw, user=now.user)
 
 
 def _is_tool(process: Process) -> bool:

@@ -691,7 +691,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.more += (replace(robot.more[0], pid=14, command=("/opt/c",)),)
     ended = robot.close()
     assert "\n  not observed before: process 14 (c) in /talker; if it does not belong" in ended.out
-    kept = "was started by a new command; sros keeps the observed command (to replace the obser"
+    kept = "was started by a new command; sros keeps the observed one: start it by that again "
     assert (
         f"  /talker: {kept}" in ended.out and "sros remembers: cd /opt && /opt/b" not in ended.err
     )
@@ -1099,6 +1099,10 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     file.write_text(known)
     robot.more = (replace(robot.more[0], pid=12),)
     assert remembered not in robot.close().err, "not in its unit"
+    robot.units["12"] = "own.service"
+    assert remembered in robot.close().err, "in a unit of its own"
+    del robot.units["12"]
+    file.write_text(known)
     assert advised not in robot.close("--proof", status=1).err
     robot.absent, robot.more = set(), others
     more = "every process in an enclave belongs there: sros did not see process 6 (thief) in "
@@ -1206,7 +1210,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     needed = robot.folder / "robot/requirements.toml"
     kept = needed.read_text()
     needed.write_text("[[only]]\n")
-    assert "[[only]] names no right" in robot.close("--proof", status=2).err
+    assert "enclaves is missing in [[only]]" in robot.close("--proof", status=2).err
     needed.write_text('[[only]]\npublish = ["/chatter"]\nenclaves = ["/listener"]\n')
     ca_key = robot.folder / "robot/keystore/private/identity_ca.key.pem"
     for readable in (key, ca_key):
