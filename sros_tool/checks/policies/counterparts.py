@@ -17,7 +17,7 @@ from sros_tool.names import (
     expand,
     is_expression,
 )
-from sros_tool.policy.model import OFFERING_RIGHT, RIGHTS, Source
+from sros_tool.policy.model import OFFERING_RIGHT, Source
 from sros_tool.policy.patterns import Names
 from sros_tool.spelling import NearNames
 
@@ -74,97 +74,125 @@ _ASKING_RIGHT = {offering: asking for asking, offering in OFFERING_RIGHT.items()
 
 def check_counterparts(checked_policy: CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about subscribed or called names that no enclave may publish or serve."""
-    names: dict[str, set[str]] = {right: set() for pair in RIGHTS.values() for right in pair}
-    for statement in checked_policy.statements:
-        if statement.allows:
-            names[statement.right.right].add(statement.name)
-    sides = {right: Names(sorted(names_of_right)) for right, names_of_right in names.items()}
+    statements = checked_policy.statements
+    sides = _Sides(statements)
+    unused = [
+        statement
+        for statement in statements
+        if (asking := _ASKING_RIGHT.get(statement.right.right)) and sides.lack(asking, statement)
+    ]
+    yield from _offered_by_others_findings(unused)
+    offers = _UnusedOffers(unused, statements, sides)
+    for statement in statements:
+        offering = OFFERING_RIGHT.get(statement.right.right)
+        if offering and sides.lack(offering, statement):
+            yield offers.finding_without_counterpart(statement, offering)
+    for statement in statements:
+        offering, name = OFFERING_RIGHT.get(statement.right.right), statement.name
+        if offering not in ("publish", "reply") or not (statement.allows and is_expression(name)):
+            continue
+        if name.removeprefix("/*/") in READING_SERVICES:  # a question to any node, if it answers
+            continue
+        if not sides.names(offering).overlaps(name) and ACTION_SEPARATOR not in name:
+            text = f"no enclave may {offering} a name that {name} matches"
+            yield statement.found(NO_COUNTERPART, text)
 
-    def is_alone(statement: PolicyStatement, other: str) -> bool:
+
+class _Sides:
+    """The names that enclaves may publish, subscribe to, serve or call."""
+
+    def __init__(self, statements: Iterable[PolicyStatement]) -> None:
+        self._stated: dict[str, set[str]] = defaultdict(set)
+        for statement in statements:
+            if statement.allows:
+                self._stated[statement.right.right].add(statement.name)
+        self.names = cache(lambda right: Names(sorted(self._stated[right])))
+        """Returns the names of a right."""
+        self.spelled = cache(
+            lambda right: NearNames(e for e in self._stated[right] if not is_expression(e))
+        )
+        """Returns the names of a right without wildcards, to search for similar names."""
+
+    def lack(self, counterpart: str, statement: PolicyStatement) -> bool:
+        """Return whether no enclave has the right ``counterpart`` to the name of a statement."""
         name = statement.name
         if not statement.allows or is_expression(name) or name in GLOBAL_TOPICS:
             return False
         # The counterpart may be in a right to the whole action.
-        return not sides[other].overlaps(name) and not action_part(name)[1]
+        return not self.names(counterpart).overlaps(name) and not action_part(name)[1]
 
-    alone = [
-        statement
-        for statement in checked_policy.statements
-        if (other := _ASKING_RIGHT.get(statement.right.right)) and is_alone(statement, other)
-    ]
-    yield from _offered_by_others_findings(alone)
-    offered: dict[str, list[PolicyStatement]] = defaultdict(list)
-    for statement in alone:
-        if not _is_service_of_every_node(statement.name):
-            offered[statement.name].append(statement)
-    nodes = {
-        expand("~", statement.profile.ns, statement.profile.node)
-        for statement in checked_policy.statements
-    }
-    near = NearNames(offered)
-    spelled = cache(lambda side: NearNames(e for e in names[side] if not is_expression(e)))
-    for statement in checked_policy.statements:
-        other = OFFERING_RIGHT.get(statement.right.right)
-        if not other or not is_alone(statement, other):
-            continue
+
+class _UnusedOffers:
+    """The offered names that nobody uses, among which the counterpart of a name may be."""
+
+    def __init__(
+        self,
+        unused: Iterable[PolicyStatement],
+        statements: Iterable[PolicyStatement],
+        sides: _Sides,
+    ) -> None:
+        self._sides = sides
+        self._by_name: dict[str, list[PolicyStatement]] = defaultdict(list)
+        for statement in unused:
+            if not _is_service_of_every_node(statement.name):
+                self._by_name[statement.name].append(statement)
+        self._near = NearNames(self._by_name)
+        profiles = (statement.profile for statement in statements)
+        self._nodes = {expand("~", profile.ns, profile.node) for profile in profiles}
+
+    def finding_without_counterpart(self, statement: PolicyStatement, other: str) -> Finding:
+        """Return the finding on a name for which no enclave has the right ``other``."""
         if statement.right.kind != "topics" and statement.is_private:
             text = (
                 f"the node may {statement.right.describe()}, a name of its own that nobody offers"
             )
-            yield statement.found(MISTAKEN_SIDE, text, f'Write {other}="ALLOW" for it.')
-            continue
-        candidates = [
-            candidate
-            for name in (statement.name, *near.similar_names(statement.name))
-            for candidate in offered.get(name, ())
+            return statement.found(MISTAKEN_SIDE, text, f'Write {other}="ALLOW" for it.')
+        same_end = self._with_same_end(statement, other)
+        candidates = self._similar(statement, other)
+        if not candidates and len(same_end) == 1:
+            candidates = [of for of in same_end if _differ_only_by_namespace(statement, of)]
+        if candidates:
+            return _misspelt_name_finding(statement, other, candidates)
+        hint = f"; {_candidates_text(same_end)}" if same_end else ""
+        # All of the similar names are used.
+        if similar := self._sides.spelled(other).similar_names(statement.name):
+            hint = f"; perhaps you mean {' or '.join(similar[:_NAMES_SHOWN])} ({other})"
+        kind = NOT_OFFERED if self._is_of_node(statement, same_end) else NO_COUNTERPART
+        return statement.found(kind, f"no enclave may {other} {statement.name}{hint}")
+
+    def _similar(self, statement: PolicyStatement, other: str) -> list[PolicyStatement]:
+        """Return the offers with a similar name, or with the same name in another namespace."""
+        name = statement.name
+        offers = [
+            offer
+            for similar in (name, *self._near.similar_names(name))
+            for offer in self._by_name.get(similar, ())
         ] + [
-            candidate
-            for name in near.same_name_elsewhere(statement.name)
-            for candidate in offered[name]
-            if candidate.right.right == other
+            offer
+            for elsewhere in self._near.same_name_elsewhere(name)
+            for offer in self._by_name[elsewhere]
+            if offer.right.right == other
         ]
         # The same node may use one name for a topic and a service, so its own names are no
         # suggestions.
-        candidates = [
-            candidate for candidate in candidates if candidate.profile is not statement.profile
+        return [offer for offer in offers if offer.profile is not statement.profile]
+
+    def _with_same_end(self, statement: PolicyStatement, other: str) -> list[PolicyStatement]:
+        """Return the offers of other nodes whose names have the same last part."""
+        return [
+            offer
+            for name in self._near.names_with_same_end(statement.name)
+            for offer in self._by_name[name][:1]
+            if offer.right.right == other and offer.profile is not statement.profile
         ]
-        same_end = [
-            candidate
-            for name in near.names_with_same_end(statement.name)
-            for candidate in offered[name][:1]
-            if candidate.right.right == other and candidate.profile is not statement.profile
-        ]
-        if (
-            not candidates
-            and len(same_end) == 1
-            and _differ_only_by_namespace(statement, same_end[0])
-        ):
-            candidates = same_end
-        if candidates:
-            yield _misspelt_name_finding(statement, other, candidates)
-        else:
-            hint = f"; {_candidates_text(same_end)}" if same_end else ""
-            # All of the similar names are used.
-            if similar := spelled(other).similar_names(statement.name):
-                hint = f"; perhaps you mean {' or '.join(similar[:_NAMES_SHOWN])} ({other})"
-            name = statement.name
-            node = name.rpartition("/")[0]
-            is_of_node = statement.right.kind != "topics" and (
-                node in nodes or any(_is_of_sibling(candidate, node) for candidate in same_end)
-            )
-            kind = NO_COUNTERPART
-            if is_of_node and not _is_service_of_every_node(name):
-                kind = NOT_OFFERED
-            yield statement.found(kind, f"no enclave may {other} {name}{hint}")
-    for statement in checked_policy.statements:
-        other, name = OFFERING_RIGHT.get(statement.right.right), statement.name
-        if other not in ("publish", "reply") or not statement.allows or not is_expression(name):
-            continue
-        if name.removeprefix("/*/") in READING_SERVICES:  # a question to any node, if it answers
-            continue
-        if not sides[other].overlaps(name) and ACTION_SEPARATOR not in name:
-            text = f"no enclave may {other} a name that {name} matches"
-            yield statement.found(NO_COUNTERPART, text)
+
+    def _is_of_node(self, statement: PolicyStatement, same_end: Iterable[PolicyStatement]) -> bool:
+        """Return whether a service or action is under the name of a node, or of its sibling."""
+        name = statement.name
+        if statement.right.kind == "topics" or _is_service_of_every_node(name):
+            return False
+        node = name.rpartition("/")[0]
+        return node in self._nodes or any(_is_of_sibling(offer, node) for offer in same_end)
 
 
 def _differ_only_by_namespace(statement_a: PolicyStatement, statement_b: PolicyStatement) -> bool:
