@@ -277,11 +277,12 @@ def _unused_rule_error(
             f"It is for {enumerated(nodes)}, which --node leaves out.",
             f"Add --node {nodes[0]}, or leave out the rule.",
         )
-    similar = _similar_names(rule, policies)
-    reason = "Perhaps an update of a package changed the name: compare its policy with the earlier."
-    if similar:
+    if similar := _similar_names(rule, policies):
         names = " or ".join(similar)
         reason = f"Perhaps the right name is {names}, for example after an update of a package."
+    else:
+        names = ", ".join(_similar_names(rule, policies, at_least=0)) or "no names"
+        reason = f"They have {names}. Perhaps an update of a package changed the name."
     return UsageError(
         f"--remap {rule} matches no name or node in the policies to merge",
         reason,
@@ -289,10 +290,11 @@ def _unused_rule_error(
     )
 
 
-def _similar_names(rule: Remapping, policies: Iterable[Policy]) -> list[str]:
+def _similar_names(rule: Remapping, policies: Iterable[Policy], at_least: float = 0.6) -> list[str]:
     """Return the names in policies that are most similar to the old name of a rule.
 
-    If no node has the rule's node, these are names of nodes.
+    If no node has the rule's node, these are names of nodes.  ``at_least`` is the lowest similarity
+    of a returned name, from 0 to 1.
     """
     from difflib import get_close_matches  # imported only for this error
 
@@ -304,15 +306,16 @@ def _similar_names(rule: Remapping, policies: Iterable[Policy]) -> list[str]:
     ]
     nodes = {profile.node for profile in profiles}
     if rule.node and rule.node not in nodes:
-        return get_close_matches(rule.node, nodes, _MOST_SHOWN)
+        return get_close_matches(rule.node, nodes, _MOST_SHOWN, at_least)
     names = {
         name
         for profile in profiles
         if rule.node in ("", profile.node)
         for group in profile.groups
         for name in group.names
+        if not is_expression(name)
     }
-    return get_close_matches(rule.old, names, _MOST_SHOWN)
+    return get_close_matches(rule.old, names, _MOST_SHOWN, at_least)
 
 
 def _moves_with_node(use: UsedRule, old: str, new: str) -> bool:

@@ -154,7 +154,8 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
         ),
         (("tate:=/s",), "Perhaps the right name is state, for"),  # `state` became longer
         (("cm:image:=/i",), "Perhaps the right name is cam, for"),
-        (("xyz:=/i",), "merge. Perhaps an update of a package changed the name: compare"),
+        (("xyz:=/i",), "merge. They have state, /image. Perhaps an update of a package changed"),
+        (("xyz:image:=/i",), "merge. They have n, cam. Perhaps an update of a package changed"),
         (
             ("cam:__node:=eye", "--remap", "cam:image:=/i"),
             "The rule cam:__node:=eye applies first. Write the node and the name as they are after "
