@@ -165,11 +165,16 @@ def test_a_process_of_a_closed_robot_is_renewed_with_all_others(tmp_path: Path) 
 
 
 def test_a_robot_with_a_name_of_people_is_noted(tmp_path: Path) -> None:
-    (tmp_path / "p.xml").write_text(policy_text({"/{robot}/base": publish("/{robot}/x")}))
-    for name in ("operator", "r1"):
+    """Or an enclave of people on each robot."""
+    for name, path, said_of in (
+        ("operator", "/{robot}/base", "/operator/base, /operator/other"),
+        ("r1", "/{robot}/base", ""),
+        ("r2", "/operator/{robot}/panel", "/operator/r2/panel"),
+    ):
+        policy = {path: publish("/{robot}/x"), "/{robot}/other": publish("/{robot}/y")}
+        (tmp_path / "p.xml").write_text(policy_text(policy))
         (tmp_path / "fleet.toml").write_text(f"[robots.{name}]\n")
         words = ("generate_artifacts", "-k", name, "-p", "p.xml", "--fleet", "fleet.toml")
         said = sros(*words, cwd=tmp_path).ok().err
-        note = "[fleet.short-lived]: the settings of the keystore make enclaves of operator short-"
-        assert (note in said) == (name == "operator")
-        assert ("for example /operator/base" in said) == (name == "operator")
+        note = f"[fleet.short-lived]: the settings of the keystore make {said_of} short-lived"
+        assert (note in said) == ("[fleet.short-lived]" in said) == bool(said_of), said

@@ -681,18 +681,20 @@ class KeystoreChange:
 
 
 def _short_lived_notes(fleet: Fleet, template: Template) -> Iterator[Note]:
-    """Yield a note on robots whose enclaves the keystore's settings make short-lived."""
-    short_lived: dict[str, str] = {}
-    for robot in fleet.robots.values() if template.short_lived else ():
-        names = enclaves_of(fleet, robot)
-        if short := [name for name in names if template.longest_validity(name) is not None]:
-            short_lived[robot.name] = short[0]
+    """Yield a note on enclaves of robots that the keystore's settings make short-lived."""
+    short_lived = [
+        name
+        for robot in fleet.robots.values()
+        for name in (enclaves_of(fleet, robot) if template.short_lived else ())
+        if template.longest_validity(name) is not None
+    ]
     if short_lived:
         text = (
-            f"the settings of the keystore make enclaves of {first_few(tuple(short_lived), 3)} "
-            f"short-lived (for example {next(iter(short_lived.values()))}), so `sros renew "
-            "--all-expiring` leaves them out: give such a robot another name or namespace, or "
-            "change `[[enclaves]]` in the settings."
+            f"the settings of the keystore make {first_few(short_lived, 3)} short-lived, so `sros "
+            "renew --all-expiring` leaves them out (it renews the robots' other enclaves). This is "
+            "right for enclaves of people: renew these by name. For a process that always runs, "
+            "choose an enclave with another path in the policy (if it begins with the name of the "
+            "robot, another name), or change `[[enclaves]]` in the settings."
         )
         yield Note("fleet.short-lived", text)
 
