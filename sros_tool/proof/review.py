@@ -1065,18 +1065,21 @@ class _Review:
             except (SrosError, OSError) as error:
                 yield _undecided_step("requirements", name, error)
                 continue
+            head = yield from self._read_requirements(files, subject.system.fleet)
+            base = yield from self._read_requirements(base_files, subject.earlier_robots)
             required = ReviewedRequirements(
                 subject,
-                head=(yield from self._read_requirements(files, subject.system.fleet)),
-                base=(yield from self._read_requirements(base_files, subject.earlier_robots)),
-                namespaces=self.request.namespaces,
-                remaps=self.request.remaps,
+                base,
+                head,
+                self.request.namespaces,
+                self.request.remaps,
                 has_fleet=bool(self.request.fleet),
                 system_of=lambda of: policy_system(of, self._circumstances(), self._template()),
             )
             yield from self._steps_of_subject(name, required)
 
     def _steps_of_subject(self, name: str, required: ReviewedRequirements) -> Iterator[ReviewStep]:
+        """Yield the steps on what HEAD breaks, and on what it drops."""
         system, files, read = required.subject.system, required.head.files, required.head.read
         self.is_relative |= required.is_relative
         self.namespaces_to_add |= common_namespaces(required.head.requirements, system.rights)
