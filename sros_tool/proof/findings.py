@@ -494,7 +494,8 @@ def decided_findings(
     ``before`` are the rights before a change, which may have renamed names in requirements, and
     ``earlier`` are the requirements before it.
     """
-    findings = [_violation_finding(violation) for violation in decided.violations]
+    of_fleet = bool(decided.violations) and not system.is_keystore and system.fleet() is not None
+    findings = [_violation_finding(violation, of_fleet) for violation in decided.violations]
     findings += [
         _part_finding(VACUOUS, requirement, why, _remedy_for_vacuous(requirement, system.rights))
         for requirement, why in _without_namespace_repeats(decided.vacuous)
@@ -567,8 +568,9 @@ _CLOSE_GOVERNANCE = (
 )
 
 
-def _violation_finding(violation: Violation) -> Finding:
+def _violation_finding(violation: Violation, of_fleet: bool) -> Finding:
     requirement, steps = violation.requirement, violation.steps
+    edit = _edit_text(violation, of_fleet)
     first = next((step.source for step in steps if step.source), None) or requirement.source
     others = [step for other_steps in violation.others for step in other_steps]
     named = [*steps, *others] if len(steps) > 1 else others
@@ -586,13 +588,16 @@ def _violation_finding(violation: Violation) -> Finding:
         _violation_text(violation),
         first.file,
         first.line,
-        _CLOSE_GOVERNANCE if ANYBODY in violation.witness.enclaves else _edit_text(violation),
+        _CLOSE_GOVERNANCE if ANYBODY in violation.witness.enclaves else edit,
         related=tuple(dict.fromkeys(related)),
     )
 
 
-def _edit_text(violation: Violation) -> str:
-    """Return a sentence on the edit that makes a requirement accept its violation, or ""."""
+def _edit_text(violation: Violation, of_fleet: bool) -> str:
+    """Return a sentence on the edit that makes a requirement accept its violation, or "".
+
+    ``of_fleet`` says whether the policy has placeholders for robots.
+    """
     requirement, steps, effect = violation.requirement, violation.steps, ""
     match requirement:
         case Only(enclaves=listed):
@@ -615,9 +620,14 @@ def _edit_text(violation: Violation) -> str:
     moved = [name for name in enclaves if space and name.startswith(f"{space}/")]
     for own in (name.removeprefix(space) for name in moved):
         if any(matches(name, own) for name in listed):
+            text = f"Change the policy at the named lines. To keep {own} out of {space}, as the "
+            if not of_fleet:
+                return f"{text}requirement says, merge its policy with `--enclave {own}`."
+            first, _, rest = own[1:].partition("/")
+            path = f"/{first}/{{robot}}" + (f"/{rest}" if rest else "")
             return (
-                f"Change the policy at the named lines. To keep {own} out of {space}, as the "
-                f"requirement says, merge its policy with `--enclave {own}`."
+                f'{text}requirement says, write path="{path}" in the policy. In a copy of the '
+                f'requirement, list "/{path}", and write {{namespace}}/ before its names.'
             )
     if moved:
         effect += f"; there, a name with one / at its beginning is below {space}"

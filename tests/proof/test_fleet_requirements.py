@@ -194,6 +194,13 @@ def test_a_finding_for_all_robots_is_shown_once(folder: Path) -> None:
     assert (ended.status, ended.out.count("requirement.violated")) == (1, 1), ended.out
     assert "only /r1/mux may publish /r1/cmd_vel: in /r1" in ended.out
     assert "the same for 1 more robot: r2" in ended.out
+    (folder / "moves.toml").write_text('[[only]]\npublish = ["cmd_vel"]\nenclaves = ["//mux"]\n')
+    ended = sros(*of_policy, "--requirements", "moves.toml", "--namespace", "/r1", cwd=folder)
+    assert (
+        'To keep /mux out of /r1, as the requirement says, write path="/mux/{robot}" in the policy. '
+        'In a copy of the requirement, list "//mux/{robot}", and write {namespace}/ before its '
+        "names." in ended.out
+    )
     of_one = sros("check", "robot.xml", "--requirements", "r.toml", cwd=folder)
     assert "stands for" in of_one.err or "Without a fleet" in of_one.err
     keys = ("-k", "ks", "-p", "robot.xml", "--fleet", "fleet.toml")
