@@ -33,6 +33,12 @@ def capitalized(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def serial_text(serial: int) -> str:
+    """Return a serial number as OpenSSL prints it: an even number of hexadecimal digits."""
+    digits = f"{abs(serial):x}"
+    return f"{'-' * (serial < 0)}{'0' * (len(digits) % 2)}{digits}"
+
+
 def natural_sort_key(name: str) -> list[tuple[int, str]]:
     """Return the key that sorts r2 before r10."""
     return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _NUMBER.split(name)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.wording import counted, enumerated, first_few, perhaps_meant
+from sros_tool.wording import counted, enumerated, first_few, perhaps_meant, serial_text
 
 
 @pytest.mark.parametrize(
@@ -12,6 +12,13 @@ from sros_tool.wording import counted, enumerated, first_few, perhaps_meant
 )
 def test_a_number_has_its_noun(number: int, words: str) -> None:
     assert counted(number, "topic") == words
+
+
+@pytest.mark.parametrize(
+    ("serial", "text"), [(0, "00"), (10, "0a"), (0xABC, "0abc"), (0xABCD, "abcd"), (-10, "-0a")]
+)
+def test_a_serial_number_is_as_openssl_prints_it(serial: int, text: str) -> None:
+    assert serial_text(serial) == text
 
 
 def test_a_noun_has_its_own_plural() -> None:

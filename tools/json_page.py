@@ -27,7 +27,8 @@ after an error, it prints variables that keep every node from starting.
 - Notes and messages for people still go to standard error; `notes` has the notes, too.
 - With `--dry-run`, `dry_run` is true, and the object says what would be done.
 - Moments are in UTC, as `2027-05-21T12:50:48Z`; serial numbers and SHA-256 are lower-case \
-hexadecimal.
+hexadecimal. Serial numbers have no leading zeros here and in the ledger; texts for people show an \
+even number of digits, as OpenSSL does.
 
 Each verb has a JSON Schema (draft 2020-12) in `sros_tool/schemas/`. A schema allows only the keys \
 that it names, and belongs to the sros with which it ships. `python -m tools.json_page` makes this \

@@ -21,7 +21,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.terminal import echo
 from sros_tool.validity import iso
-from sros_tool.wording import counted
+from sros_tool.wording import counted, serial_text
 
 if TYPE_CHECKING:
     from sros_tool.keystore.describe import (
@@ -173,9 +173,10 @@ def _show_history(keystore: OpenedKeystore, policy: Path | None, as_json: bool) 
             until = f"until {entry.not_after}" if expires else ""
             named = f" (SHA-256 {entry.sha256[:8]})" if entry.what == "ca" else ""
             subject = f"{entry.enclave or entry.subject}{named}"
+            serial = serial_text(int(entry.serial, 16)) if entry.serial else ""
             source = f"policy {entry.policy[:12]}" if entry.policy else ""
             from_backup = "from a backup; entries may be missing" * (entry.what == RESTORED)
-            words = (subject, until, entry.serial, source, from_backup or entry.reason)
+            words = (subject, until, serial, source, from_backup or entry.reason)
             line = "  ".join(word for word in words if word)
             shown = f"{entry.time}  {entry.what:11}  {item.status:10}  {line}"
             echo(shown.rstrip())
@@ -255,7 +256,8 @@ def _authority_lines(role: str, authority: AuthorityFile | UnreadableFile) -> It
     for further in authority.file.further or ():
         yield (
             f"    in the same file: {_authority_name(further.subject, further.sha256)}, "
-            f"{further.key}, valid until {iso(further.not_after)}, serial {further.serial}"
+            f"{further.key}, valid until {iso(further.not_after)}, "
+            f"serial {serial_text(int(further.serial, 16))}"
         )
     if crl := authority.file.crl:
         yield f"    {_list_text(crl)}"
@@ -311,7 +313,7 @@ def _certificate_file_lines(certificates: DescribedCertificates) -> Iterator[str
 def _certificate_lines(certificate: CertificateFacts) -> Iterator[str]:
     yield f"subject {certificate.subject}"
     yield f"issuer {certificate.issuer}"
-    yield f"serial {certificate.serial}"
+    yield f"serial {serial_text(int(certificate.serial, 16))}"
     yield f"{certificate.key}, signed with {certificate.signature}"
     valid = "valid now" if certificate.valid_now else "NOT VALID NOW"
     yield f"from {iso(certificate.not_before)} to {iso(certificate.not_after)}: {valid}"
@@ -321,7 +323,7 @@ def _certificate_lines(certificate: CertificateFacts) -> Iterator[str]:
 def _revocation_list_lines(described_list: DescribedList) -> Iterator[str]:
     yield _list_text(described_list.facts)
     for serial in described_list.facts.revoked:
-        yield f"  {serial}"
+        yield f"  {serial_text(int(serial, 16))}"
 
 
 def _list_text(crl: RevocationListFacts) -> str:

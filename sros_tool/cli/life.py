@@ -39,7 +39,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.terminal import echo
-from sros_tool.wording import first_few
+from sros_tool.wording import first_few, serial_text
 
 if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
@@ -381,8 +381,8 @@ def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> It
     newest, *further_lists = lists
     yield f"revocation list {newest.number}, until {iso(newest.next_update)}"
     for entry in newest.revoked:
-        serial = f"{entry.serial:x}"
-        yield f"  {serial}  {iso(entry.date)}  {entry.reason}  {names.get(serial, '')}".rstrip()
+        serial, enclave = serial_text(entry.serial), names.get(f"{entry.serial:x}", "")
+        yield f"  {serial}  {iso(entry.date)}  {entry.reason}  {enclave}".rstrip()
     for other_list in further_lists:  # of the other CA during a rotation
         yield (
             f"next to it, list {other_list.number} of the other CA, "

@@ -31,7 +31,7 @@ from sros_tool.proof.sources import AT, KEYSTORE_ITSELF, AccessSource, Trust
 from sros_tool.proof.worlds import ROS_TOPICS, names_of_expression, valid_topics
 from sros_tool.proof.zenoh_settings import looser_settings
 from sros_tool.translate import contradictions, governance_for, protected_topics
-from sros_tool.wording import counted
+from sros_tool.wording import counted, serial_text
 from sros_tool.zenoh.configuration import ZenohNetwork
 
 
@@ -218,7 +218,7 @@ def _unrevoked_certificates(old: AccessSource, new: AccessSource) -> Iterator[Se
             f"{names[0]} again trusts" if len(names) == 1 else f"{len(names)} enclaves again trust"
         )
         text = f"{who} anyone who has the key of this certificate"
-        yield _looser_change(f"certificate {serial:x}", "revoked", "trusted", text)
+        yield _looser_change(f"certificate {serial_text(serial)}", "revoked", "trusted", text)
     if (more := len(trusted) - _MOST_SERIALS) > 0:
         text = "enclaves again trust anyone who has a key of these certificates"
         yield _looser_change(counted(more, "more certificate"), "revoked", "trusted", text)

@@ -26,6 +26,7 @@ from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.crl import load_crl
+from sros_tool.wording import serial_text
 from tests.support.harness import copy_of
 
 pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the program openssl is needed")
@@ -198,7 +199,9 @@ def test_no_older_list_takes_the_place_of_a_newer_one(
     (remark,) = check_lists(files["revoked"], files["restored twice"], str(tmp_path))
     (revoked,) = load_crl(files["revoked"]["enclaves/a/crl.pem"], "it").revoked
     lost = "The current revocation list has 1 serial numbers that the new one lacks, such as {}."
-    assert remark.startswith(lost.format(f"{revoked.serial:x}")), "as inspect --history shows it"
+    assert remark.startswith(lost.format(serial_text(revoked.serial))), (
+        "as inspect --history shows it"
+    )
     assert "`sros inspect KEYSTORE --history` can" in remark
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(RefusedError, match="lacks openssl"):

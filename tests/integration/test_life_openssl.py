@@ -94,16 +94,19 @@ def test_the_list_refuses_whom_it_names_and_nobody_else(root: Path, tmp_path: Pa
     verify_signatures(root, enclaves / "a")
 
 
-def test_the_text_of_the_list(root: Path) -> None:
+def test_the_text_of_the_list(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     enclaves = root / "enclaves"
+    monkeypatch.setattr("cryptography.x509.random_serial_number", lambda: 0xABC)
+    sros("create_enclave", root, "/e").ok()
     serials = [
         openssl("x509", "-in", enclaves / name / "cert.pem", "-noout", "-serial")
         .strip()
         .removeprefix("serial=")
-        .lstrip("0")
-        for name in ("a", "b")
+        for name in ("e", "b")
     ]
-    sros("revoke", root, "/a", "--reason", "keyCompromise").ok()
+    certificate = root.parent / "e.pem"
+    certificate.write_bytes((enclaves / "e/cert.pem").read_bytes())
+    sros("revoke", root, "/e", "--reason", "keyCompromise").ok()
     sros("revoke", root, "/b").ok()
     sros("crl", root, "--refresh").ok()
     crl = root / "public/identity_ca.crl.pem"
@@ -117,7 +120,12 @@ def test_the_text_of_the_list(root: Path) -> None:
     assert identifier
     assert identifier[1] in openssl("x509", "-in", authority, "-noout", "-text")
     listed = re.findall(r"Serial Number: ([0-9A-F]+)", said)
-    assert [serial.lstrip("0") for serial in listed] == serials
+    assert listed == serials and serials[0] == "0ABC"
+    for words in (
+        ("crl", root), ("inspect", root, "--history"),
+        ("inspect", crl), ("inspect", certificate),
+    ):  # fmt: skip
+        assert re.search(r"(^|\s)0abc(\s|\Z)", sros(*words).out), words
     assert said.count("Key Compromise") == 1
     assert said.count("X509v3 CRL Reason Code") == 1  # unspecified is left out (RFC 5280, 5.3.1)
 

@@ -34,6 +34,7 @@ from sros_tool.pki.certificates import common_name, issue_ca, make_request, pem,
 from sros_tool.pki.crl import RevocationEntry, sign_crl
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.validity import Window, parse_iso
+from sros_tool.wording import serial_text
 from tests.support.harness import certificate, copy_of, policy_text, publish, snapshot, sros
 from tests.support.messages import key_of, said_by, signed_message
 
@@ -257,7 +258,7 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     before = snapshot(site)
     for crl, words in (
         (b"", rf"only this service signs .*: {serial:x}. Give the list of the service with"),
-        (listed(others), f"It does not revoke {serial:x}"),
+        (listed(others), f"It does not revoke {serial_text(serial)}"),
         (listed(serial, key=OTHER), "did not sign it"),
         (listed(serial, days=-1), "not now"),
         (listed(serial, number=0), "Its number is 0, and has to be higher than 0"),
@@ -270,7 +271,7 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     assert (site / f"revoked/{serial:x}/cert.pem").exists()
     with pytest.raises(KeystoreError, match="Its number is 5, and has to be higher than 5"):
         refresh_crl(site, now=now(), crl=listed(serial, number=5))
-    with pytest.raises(KeystoreError, match=f"It does not revoke {serial:x}"):
+    with pytest.raises(KeystoreError, match=f"It does not revoke {serial_text(serial)}"):
         refresh_crl(site, now=now(), crl=listed(others, number=6))
     mine = certificate(site / "enclaves/listener/cert.pem").serial_number
     with pytest.raises(KeystoreError, match="could not start in /listener"):

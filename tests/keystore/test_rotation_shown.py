@@ -29,6 +29,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import generate_key
 from sros_tool.validity import window
+from sros_tool.wording import serial_text
 from tests.support.harness import sros
 
 NOW = datetime.now(UTC)
@@ -194,7 +195,7 @@ def test_inspect_shows_all_that_a_ca_file_holds(root: Path) -> None:
     path = root / f"public/{file}.cert.pem"
     said = sros("inspect", path).ok().out
     for each in (old, new):
-        assert f"serial {each.serial_number:x}\n" in said
+        assert f"serial {serial_text(each.serial_number)}\n" in said
         assert digest(each) in said
     assert said.count("another certificate in the same file") == 1
     assert "revocation list 2 of " in said
@@ -203,7 +204,7 @@ def test_inspect_shows_all_that_a_ca_file_holds(root: Path) -> None:
     assert [each["sha256"] for each in described["further"]] == [digest(new)]
     assert described["crl"]["revoked"] == []
     whole = sros("inspect", root).ok().out
-    assert f"serial {new.serial_number:x}" in whole
+    assert f"serial {serial_text(new.serial_number)}" in whole
     assert "revocation list 2 of " in whole
     authorities = json.loads(sros("inspect", root, "--json").ok().out)["authorities"]
     assert authorities["identity"]["further"][0]["sha256"] == digest(new)

@@ -40,7 +40,7 @@ from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy.model import stated_protections
 from sros_tool.policy.rights import Right, compare, policy_rights
 from sros_tool.translate import grant_rights
-from sros_tool.wording import first_few
+from sros_tool.wording import first_few, serial_text
 
 SERIAL_TWICE = FindingKind(
     "keystore.serial-twice",
@@ -281,7 +281,7 @@ def check_issued(
     certificates = {summary.name: summary.certificate_digest for summary in summaries}
     different = {summary.certificate_digest: summary for summary in summaries}.values()
     for (_, serial), names in _shared_values(((t.issuer, t.serial), t.name) for t in different):
-        yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
+        yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial_text(serial)}")
     for _, names in _shared_values((summary.key_digest, summary.name) for summary in summaries):
         if len({certificates[name] for name in names}) > 1:
             text, remedy = "their certificates have the same public key", ""

@@ -80,7 +80,7 @@ from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.validity import Window, elapsed, iso, parse_duration, parse_iso, time_of_file
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted, first_few, serial_text
 
 _MOST_NAMES = 100_000
 """Maximum number of names that sros reads in an inbox to find folders that belong to no robot."""
@@ -733,9 +733,9 @@ class _Verifier:
         of_whom = f", an enclave of {owner.name}" if owner else ", which belongs to no robot"
         if signer.serial_number in self._revoked:
             why = (
-                f"its certificate, {signer.serial_number:x}, was revoked: perhaps the robot lacks "
-                "its new keys, or another computer that has earlier keys of the robot sends "
-                "messages in its place"
+                f"its certificate, {serial_text(signer.serial_number)}, was revoked: perhaps the "
+                "robot lacks its new keys, or another computer that has earlier keys of the robot "
+                "sends messages in its place"
             )
             if issued and owner != robot:
                 why = (

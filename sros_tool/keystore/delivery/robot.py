@@ -97,7 +97,7 @@ from sros_tool.pki.token import (
 )
 from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChanges, Notes, Words
-from sros_tool.wording import counted
+from sros_tool.wording import counted, serial_text
 from sros_tool.xml import read_bytes
 
 
@@ -670,11 +670,11 @@ def _lost_revocation_notes(enclave_dir: Path, answer: RequestAnswer) -> Iterator
     if lost := lost_serials(*_installed_and_sent_lists(enclave_dir, answer)):
         text = (
             f"the earlier revocation list revokes {counted(len(lost), 'certificate')} that the new "
-            f"list lacks, such as {min(lost):x}. This is right if these certificates have expired: "
-            "`sros inspect KEYSTORE --history` shows when they expire. If a certificate has not "
-            "expired, or is not shown, the keystore comes from a backup: then import the list of "
-            "another robot with `sros crl KEYSTORE --refresh --crl FILE`, and have the request "
-            "signed again."
+            f"list lacks, such as {serial_text(min(lost))}. This is right if these certificates "
+            "have expired: `sros inspect KEYSTORE --history` shows when they expire. If a "
+            "certificate has not expired, or is not shown, the keystore comes from a backup: then "
+            "import the list of another robot with `sros crl KEYSTORE --refresh --crl FILE`, and "
+            "have the request signed again."
         )
         yield Note("import.list-lacks", text)
 

@@ -50,7 +50,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import Revocations, newest_revocations
 from sros_tool.pki.keys import PublicKey, load_enclave_key
 from sros_tool.validity import iso
-from sros_tool.wording import counted
+from sros_tool.wording import counted, serial_text
 from sros_tool.xml import read_bytes
 
 _ANSWER_AGAIN = (
@@ -310,8 +310,8 @@ def _lost_revocations(
                     shown = (
                         f"revokes {counted(len(lacking), 'certificate')} that the keystore's "
                         "revocation list lacks",
-                        f"The certificate with the serial number {min(lacking):x} has perhaps not "
-                        "expired yet",
+                        "The certificate with the serial number "
+                        f"{serial_text(min(lacking))} has perhaps not expired yet",
                     )
                 else:
                     continue

@@ -70,7 +70,7 @@ from sros_tool.pki.crl import (
     signed_by,
 )
 from sros_tool.validity import BACKDATE, Window, iso
-from sros_tool.wording import capitalized, counted
+from sros_tool.wording import capitalized, counted, serial_text
 
 
 class LostRecords:
@@ -511,7 +511,7 @@ class RevocationListSigner:
             KeystoreError: the list is missing, is not signed by the identity CA, is not later than
                 the present list, is not valid now, or does not revoke all ``serials``.
         """
-        numbers = ", ".join(sorted(f"{serial:x}" for serial in serials))
+        numbers = ", ".join(map(serial_text, sorted(serials)))
         revoke = f"Revoke these certificates at the service: {numbers}. " if numbers else ""
         remedy = f"{revoke}Give the list of the service with --crl FILE."
         if not self._given_list:
@@ -529,7 +529,7 @@ class RevocationListSigner:
         elif crl.number <= (least := self.present.number if self.present else 0):
             fault = f"its number is {crl.number}, and has to be higher than {least}"
         elif missing := sorted(serial for serial in serials if not crl.revokes(serial)):
-            fault = f"it does not revoke {', '.join(f'{serial:x}' for serial in missing)}"
+            fault = f"it does not revoke {', '.join(map(serial_text, missing))}"
         else:
             document = crl.list.public_bytes(serialization.Encoding.PEM)
             validity = Window(crl.this_update, crl.next_update)

@@ -122,7 +122,7 @@ def _remark_on_lost(name: str, present: _List, new: _List | None) -> str:
         return ""
     return (
         f"The current revocation list has {len(lost)} serial numbers that the new one"
-        f" lacks, such as {min(lost).lstrip('0').lower()}. This is right if these certificates have"
+        f" lacks, such as {min(lost).lower()}. This is right if these certificates have"
         " expired, which the robot cannot tell, but `sros inspect KEYSTORE --history` can. If a"
         " certificate has not expired, or is not there, the keystore comes from a backup: then take"
         " the list over from another robot, with `sros crl KEYSTORE --refresh --crl FILE`, and"
