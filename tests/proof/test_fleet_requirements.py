@@ -198,8 +198,8 @@ def test_a_finding_for_all_robots_is_shown_once(folder: Path) -> None:
     ended = sros(*of_policy, "--requirements", "moves.toml", "--namespace", "/r1", cwd=folder)
     assert (
         'To keep /mux out of /r1, as the requirement says, write path="/mux/{robot}" in the '
-        'policy. In a copy of the requirement, list "//mux/{robot}", and write {namespace}/ before its '
-        "names." in ended.out
+        'policy. In a copy of the requirement, list "//mux/{robot}", and write {namespace}/ before '
+        "its names." in ended.out
     )
     of_one = sros("check", "robot.xml", "--requirements", "r.toml", cwd=folder)
     assert "stands for" in of_one.err or "Without a fleet" in of_one.err
