@@ -509,6 +509,13 @@ class Examiner:
                     "Start the node in its enclave: `sros run "
                     f"{quote(self._root or 'KEYSTORE')} {quote(enclaves[0])} -- COMMAND`."
                 )
+                if meant := self._same_name_elsewhere(denial, node, nodes):
+                    ns = meant.rpartition("/")[0] or "/"
+                    return [cause, f"{meant} has the same name in another namespace"], (
+                        f"If the node should be {meant}, its namespace is wrong: start it with "
+                        f"`--ros-args -r __ns:={quote(ns)}`, or with `namespace=` in its launch "
+                        f"file. If it should be {node}, {_within_sentence(advice)}"
+                    )
                 return self._composed_cause(denial, node, nodes, cause, advice)
             if nodes:
                 advice = _renaming_advice(nodes, node, denial.enclave)
@@ -520,6 +527,16 @@ class Examiner:
                 f"{quote(denial.enclave)} --from-log LOG`."
             )
         return [], ""
+
+    def _same_name_elsewhere(self, denial: Denial, node: str, nodes: Sequence[str]) -> str:
+        """Return the only node of ``nodes`` whose name differs by the namespace, or "".
+
+        The result is "" if the log shows that the process runs this node, too.
+        """
+        same = [other for other in nodes if _last_part(other) == _last_part(node)]
+        is_known = len(same) == 1 and not is_expression(same[0])
+        logged = self._logging_nodes.get(denial.process, ())
+        return same[0] if is_known and same[0] not in logged else ""
 
     def _enclaves_for(self, node: str, enclave: str) -> tuple[str, ...]:
         """Return the enclaves for a node; ``enclave`` is the one in which its process runs."""
@@ -974,14 +991,17 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
 def _composing_advice(nodes: Sequence[str]) -> str:
     """Return the remedy for one process that runs ``nodes`` although they have several enclaves."""
     spaces = {node.rpartition("/")[0] for node in nodes}
-    ns = spaces.pop() if len(spaces) == 1 else ""
-    options = [f"--namespace {quote(ns)}"] * bool(ns) + [f"--enclave {quote(f'{ns}/NEW')}"]
-    options += [f"--node {quote(node.rpartition('/')[2])}" for node in nodes]
+    if len(spaces) == 1:
+        ns, each = spaces.pop(), ""
+        options = [f"--namespace {quote(ns)}"] * bool(ns) + [f"--enclave {quote(f'{ns}/NEW')}"]
+        options += [f"--node {quote(_last_part(node))}" for node in nodes]
+    else:
+        options, each = ["--namespace NS", "--enclave /NEW", "--node NODE"], ", once for each node"
     return (
         "give these nodes one enclave: write their profiles into one <enclave> of the policy. "
         "Profiles from the policy of a package, merge again into a policy without these nodes: "
-        f"`sros merge_policy POLICY OTHER {' '.join(options)}`. Then start the process in the new "
-        "enclave."
+        f"`sros merge_policy POLICY OTHER {' '.join(options)}`{each}. Then start the process in "
+        "the new enclave."
     )
 
 

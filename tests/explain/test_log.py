@@ -1294,6 +1294,28 @@ def test_a_node_in_another_enclave_of_a_policy_without_a_keystore(
         assert f"{NEXT}If one process runs {where} and {namespace}/guard, give these nodes" in found
 
 
+@pytest.mark.parametrize("is_logged", [False, True])
+def test_a_node_of_another_instance_in_an_enclave(is_logged: bool, tmp_path: Path) -> None:
+    """Its namespace is wrong; unless the log shows that the process runs both instances."""
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    served = "".join(f"<service>~/{name}</service>" for name in PARAMETER_SERVICES)
+    reply = f'<services reply="ALLOW">{served}</services>'
+    text = policy_text({"/left/charger": reply, "/right/charger": reply})
+    for ns in ("left", "right"):
+        text = text.replace('ns="/" node="n"', f'ns="/{ns}" node="charger"', 1)
+    policy.write_text(text)
+    log.write_text(
+        "[INFO] [1.0] [rcl]: Found security directory: /k/enclaves/left/charger\n"
+        "[SECURITY Error] rq/right/charger/get_parametersRequest topic not found in allow rule."
+        " -> check_create_datareader\n" + "[INFO] [1.1] [left.charger]: ready\n" * is_logged
+    )
+    found = sros("explain", policy, "/left/charger", "--log", log).out
+    wrong = "If the node should be /left/charger, its namespace is wrong: start it with `--ros-args"
+    assert (f"remedy    {wrong} -r __ns:=/left`" in found) is not is_logged
+    merge = "`sros merge_policy POLICY OTHER --namespace NS --enclave /NEW --node NODE`, once for"
+    assert (merge in found) is is_logged
+
+
 def test_a_denial_by_a_rule_is_not_said_to_miss_something(tmp_path: Path) -> None:
     policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
     policy.write_text(policy_text({"/a": publish("/x").replace("ALLOW", "DENY")}))
