@@ -659,6 +659,8 @@ def _to_do_lines(answer: Answer) -> Iterator[str]:
         for requirement in forbidding:
             text = f"{_place_text(requirement.source)} forbids this: {demand(requirement)}"
             yield _labeled_row("required", text)
+        permit = "If the enclave is meant to have this right, first change the requirement; this "
+        yield _labeled_row("remedy", f"{permit}command then shows what to add to the policy.")
         return
     if answer.change:
         yield from _change_lines(answer)

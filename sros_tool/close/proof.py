@@ -122,10 +122,6 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     files = _proof_of_files(robot, expired, unsigned_text)
     required = _proof_of_requirements(robot, unsigned_text)
     talk = proof_of_talk(running, nodes, away, restarts)
-    if talk.fails and (present := sorted(not_here - away)):
-        options = " ".join(f"--without {name}" for name in present)
-        away_text = f"if the other machines are away on purpose, add {options}"
-        talk = talk._replace(reason=f"{talk.reason}; {away_text}")
     silence = _proof_of_silence(robot, nodes.nodes_to_compare(away), hears=talk.holds is not None)
     connected = [*_proof_of_connections(robot)]
     if talk.holds and not connected:

@@ -48,6 +48,9 @@ from sros_tool.runtime.environment import ROS_ARGS, named_enclave
 from sros_tool.runtime.unit_properties import unit_properties
 from sros_tool.wording import counted, enumerated, first_few
 
+_MOST_LATER = 20
+"""Maximum number of names that a text shows of what the open robot did not have."""
+
 _MOST_TRIES = 3
 """Maximum number of looks of the observer, until the nodes do what they did on the open robot."""
 
@@ -121,8 +124,16 @@ def proof_of_talk(
             details = [*comparison.details(), *renamed]
             return Proof(TALK, True, comparison.summary(), comparison.denied, details)
     first, *others = reasons
-    texts = f"{reasons[first]}{_remedy(robot, first)}", *(f"also {reasons[why]}" for why in others)
-    details = [*_name_clauses(nodes, comparison.current, fails=True)]
+    texts = [
+        f"{reasons[first]}{_remedy(robot, first)}",
+        *(f"also {reasons[why]}" for why in others),
+    ]
+    if elsewhere := comparison.unseen_elsewhere():
+        options = " ".join(f"--without {name}" for name in elsewhere)
+        texts.append(f"if the other machines are away on purpose, add {options}")
+    details = [*comparison.not_compared(), *_name_clauses(nodes, comparison.current, fails=True)]
+    if comparison.away:
+        details.append(f"compared without {', '.join(comparison.away)}")
     return Proof(TALK, False, "; ".join(texts), comparison.denied, details)
 
 
@@ -165,6 +176,11 @@ class _TalkComparison:
         self._intermittent = nodes.intermittent_endpoints(self.current)
 
     @property
+    def away(self) -> Sequence[str]:
+        """The enclaves that are not compared, because their processes need not run here."""
+        return sorted(self._away)
+
+    @property
     def denied(self) -> Sequence[str]:
         """The rights, as sentences, that the nodes used and the keystore denies."""
         return [str(right) for right in self._denied]
@@ -175,11 +191,7 @@ class _TalkComparison:
         What nodes of the enclaves ``restarted`` lack is left out.
         """
         ended, nodes = self._ended, self._nodes
-        unseen = [
-            node
-            for node in self._audited["unseen"]
-            if node["enclave"] not in {*self._away, *restarted}
-        ]
+        unseen = [node for node in self._unseen() if node["enclave"] not in restarted]
         before, expected = (
             nodes.nodes_to_compare(self._away, self.current),
             nodes.expected_nodes(self.current),
@@ -225,6 +237,13 @@ class _TalkComparison:
             ],
         }
 
+    def _unseen(self) -> list[Mapping[str, Any]]:
+        return [node for node in self._audited["unseen"] if node["enclave"] not in self._away]
+
+    def unseen_elsewhere(self) -> list[str]:
+        """Return the enclaves of other machines that have unseen nodes."""
+        return sorted({node["enclave"] for node in self._unseen()} & self._running.robot.not_here)
+
     def _lost_endpoints(self, before: Iterable[ObservedNode]) -> set[tuple[str, Endpoint]]:
         """Return the endpoints that nodes had before and lack now, except denied endpoints."""
         lost = {*endpoints_of(before)} - _denied_endpoints(self._denied)
@@ -269,7 +288,7 @@ class _TalkComparison:
         endpoints -= self._lost_endpoints(as_now)
         text = f"{nodes_text(before.nodes)} with {len(endpoints)} endpoints as before (types are "
         text += "not compared)"
-        return text + (f", without {', '.join(sorted(self._away))}" if self._away else "")
+        return text + (f", without {', '.join(self.away)}" if self.away else "")
 
     def details(self) -> Iterator[str]:
         """Yield clauses on rights that the policy takes away, unused rights, and new nodes."""
@@ -297,7 +316,7 @@ class _TalkComparison:
         if not self._audited["settled"]:
             yield "the ROS graph kept changing meanwhile, or could not be read in time"
         known = {*map(node_name, before.nodes)}
-        with_profile, without_profile = self._nodes.divide_by_profile(self.current.nodes)
+        _, without_profile = self._nodes.divide_by_profile(self.current.nodes)
         new = sorted(
             f"{node_name(node)} in {' or '.join(node.enclaves) or 'no enclave'}"
             for node in without_profile
@@ -305,8 +324,13 @@ class _TalkComparison:
         )
         if new:
             yield f"new, without a profile: {first_few(new, MOST_NAMES)}"
+        yield from self.not_compared()
+
+    def not_compared(self) -> Iterator[str]:
+        """Yield clauses on what sros did not see on the open robot, or what was no ROS node."""
+        with_profile, _ = self._nodes.divide_by_profile(self.current.nodes)
         if later := self._later_names(with_profile):
-            names = first_few(later, MOST_NAMES)
+            names = first_few(later, _MOST_LATER)
             yield (
                 f"not compared, because `sros close` did not see these on the open robot: {names}"
             )

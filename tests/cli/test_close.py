@@ -638,7 +638,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     elsewhere = sros("env", root, "/talker", "--domain", "5", cwd=robot.folder).err
     add = "add the domain to its keystore, with `sros update_keystore robot/keystore --domain 0,5"
     assert add in elsewhere
-    forbids = r"robot/requirements\.toml:\d+ forbids this: only /talker may publish /chatter\n$"
+    forbids = r"robot/requirements\.toml:\d+ forbids this: only /talker may publish /chatter\n  remedy .*\n$"
     for source in (root, "robot/policy.xml"):
         asked = "explain", source, "/listener", "publish", "/chatter"
         denied = sros(*asked, cwd=robot.folder).out
@@ -2467,6 +2467,9 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     look = policies_dir() / "operator_look.xml"
     sros("merge_policy", policy, look, "--in-place", cwd=robot.folder).ok()
     robot.close("--elsewhere", "/operator/look")
+    robot.remaining = (TALKER,)
+    said = robot.close("--proof", status=1).out
+    assert "add --without /listener\n" in said and "\n  compared without /operator/look\n" in said
     policy.write_bytes(without_person)
     assert list_enclaves(robot.folder / "robot/export") == ("/sros_observer", "/talker")
     robot.remaining = (TALKER, LISTENER)
