@@ -21,6 +21,8 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import MESSAGE_FILE
 from sros_tool.wording import capitalized
 
+_NO_UPLOADS = (http.HTTPStatus.METHOD_NOT_ALLOWED, http.HTTPStatus.NOT_IMPLEMENTED)
+
 
 class RefusedError(UnavailableError):
     """The web server refuses a message, perhaps because it refuses the client's certificate."""
@@ -76,11 +78,15 @@ def send(
         ) from error
     if not 200 <= reply.status < 300:
         kind = RefusedError if reply.status in REFUSALS else UnavailableError
-        raise kind(
-            failure,
-            f"The server answers {reply.status} to PUT {where}.",
-            "See the log of the server.",
-        )
+        why = f"The server answers {reply.status} to PUT {where}"
+        if reply.status in _NO_UPLOADS:
+            raise kind(
+                failure,
+                f"{why}: it takes no uploads here.",
+                "Configure the server as docs/howto/fleet_server.md says, or give `sros agent "
+                "init` another --inbox: the URL of another server, or a folder.",
+            )
+        raise kind(failure, f"{why}.", "See the log of the server.")
 
 
 def _write_message(inbox: Path, robot: str, message: bytes) -> None:

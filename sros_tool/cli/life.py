@@ -307,6 +307,7 @@ def crl(
       $ sros crl keystore --refresh
     """
 
+    from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import PUBLIC, list_enclaves
     from sros_tool.keystore.lifecycle.revoke import refresh_crl
     from sros_tool.keystore.reader import OpenedKeystore
@@ -324,7 +325,9 @@ def crl(
         if dry_run and not as_json:
             print_plan(root, result.changes)
             return 0
-        print_follow_up(result, restart=not dry_run)
+        published = publish_command(root) if result.changes and not result.restart else ""
+        after = [f"robots that fetch get the changed files after {published}"] if published else []
+        print_follow_up(result, after, restart=not dry_run)
     keystore = OpenedKeystore(root)
     lists = keystore.revocation_lists
     if not (lists or (root / PUBLIC).is_dir()):

@@ -62,11 +62,17 @@ def test_a_server_gets_the_message_of_the_robot(server: Inbox) -> None:
     assert server.agents == {"sros"}
 
 
-@pytest.mark.parametrize("status", [301, 403, 500])
-def test_a_server_that_does_not_take_it_is_said(status: int, server: Inbox) -> None:
+@pytest.mark.parametrize(
+    ("status", "remedy"),
+    [
+        *((status, "See the log of the server") for status in (301, 403, 500)),
+        *((status, "takes no uploads here.*--inbox: .* or a folder") for status in (405, 501)),
+    ],
+)
+def test_a_server_that_does_not_take_it_is_said(status: int, remedy: str, server: Inbox) -> None:
     """No redirect is followed, which could lead anywhere."""
     server.status = status
-    with pytest.raises(UnavailableError, match=f"The server answers {status} to PUT"):
+    with pytest.raises(UnavailableError, match=f"The server answers {status} to PUT.*{remedy}"):
         send(server.url, "r1", b"message")
     assert list(server.kept) == ["/inbox/r1/confirmation.p7s"]
 

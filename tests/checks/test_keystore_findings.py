@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.documents import TIME_WINDOW
+from sros_tool.checks.keystores.files import INTERRUPTED
 from sros_tool.checks.keystores.issued import OLD_PERMISSIONS, OLDER_LIST
 from sros_tool.checks.keystores.keystore import keystore_findings, with_joined_findings
 from sros_tool.checks.keystores.opened import Circumstances
@@ -28,7 +29,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.validity import iso
 from tests.checks.bench import SECRET, Bench, new_key
 from tests.checks.keystore_cases import CASES, STRANGER, also_trusted, give_away
-from tests.support.harness import copy_of, policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
 from tests.support.long_form import some
 from tests.support.users import as_root
 
@@ -99,6 +100,16 @@ def test_a_remedy_that_needs_ca_keys_is_for_the_original_keystore(bench: Bench) 
     assert told.endswith("Then export the enclave again.")
     (bench.checked / "enclaves/base/permissions.xml").write_text("<dds/>")
     assert remedy("enclave.xml-differs").startswith("Delete permissions.xml: exports do not")
+
+
+def test_the_remedy_of_an_interrupted_change_changes_nothing_else(tmp_path: Path) -> None:
+    sros("create_keystore", root := tmp_path / "ks", "--template", "production").ok()
+    sros("create_enclave", root, "/a").ok()
+    before = snapshot(root)
+    (root / ".sros-transaction").mkdir(0o700)
+    command = INTERRUPTED.remedy.split("`")[1].replace("KEYSTORE", str(root))
+    assert "no enclave needs to be renewed" in sros(*command.split()[1:]).ok().err
+    assert snapshot(root) == before
 
 
 def test_a_remedy_that_is_an_export_says_so_once() -> None:

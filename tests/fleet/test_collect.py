@@ -1337,7 +1337,8 @@ def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
     backup = copy_of(home.root, home.folder / "backup")
     shutil.copytree(home.folder / "pub", home.folder / "pub of the backup")
     home.run("renew", "ks", "/r1/base")
-    home.run("crl", "ks", "--refresh")
+    said = sros("crl", "ks", "--refresh", cwd=home.folder).err
+    assert "robots that fetch get the changed files after `sros fleet publish ks PUB`" in said
     home.run(*publish)
     number = read_published(OpenedKeystore(home.root)).robots["r1"].release.number
     lost_list = (home.root / "enclaves/r1/base/crl.pem").read_text()

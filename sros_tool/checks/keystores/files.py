@@ -144,7 +144,8 @@ INTERRUPTED = FindingKind(
     "DDS still loads a complete set of files, old or new. The next verb that writes completes or "
     "undoes the change.",
     "sros: sros_tool/keystore/transaction.py.",
-    "Run any verb of sros that writes, such as `sros create_enclave`.",
+    "Run `sros renew KEYSTORE --all-expiring 1d`: before it renews what expires within a day, it "
+    "completes or undoes the interrupted change.",
 )
 FOREIGN_STAGE = FindingKind(
     "keystore.transaction-not-ours",
