@@ -45,6 +45,7 @@ from sros_tool.runtime.units import unit_instance
 from sros_tool.runtime.variables import ENABLE, KEYSTORE
 
 _LONGEST_PATH = 200
+_LONGEST_CLAUSE = 200
 _RESTART_SECONDS = 120.0
 _COMMAND_SECONDS = 30.0
 """How long a command, such as systemctl, may take."""
@@ -335,11 +336,20 @@ class Systemd:
         except OSError as error:
             raise UnavailableError(failure, f"{error.strerror or error}.") from error
         if done.returncode:
-            error_text = plain(" ".join((done.stderr or done.stdout).split()), _LONGEST_PATH)
+            error_text = _clause(" ".join((done.stderr or done.stdout).split()))
             raise UnavailableError(
                 failure, f"{error_text or f'Its exit status is {done.returncode}'}."
             )
         return done.stdout
+
+
+def _clause(text: str) -> str:
+    """Return what the system says as a clause, without characters that nobody sees.
+
+    Punctuation stays: on the keystore machine, problems of robots may be any printable text.
+    """
+    seen = (letter if letter.isprintable() else "?" for letter in text[:_LONGEST_CLAUSE])
+    return "".join(seen).removesuffix(".")
 
 
 def _due_units(
@@ -404,7 +414,7 @@ def restart_units(
                 stderr=subprocess.DEVNULL,
             )
         except (OSError, subprocess.SubprocessError) as error:
-            why = plain(str(error), 120)
+            why = _clause(str(error))
             text = "No unit is restarted, because the command in `restart_if` did not start or end"
             return Restarts(problems=(*problems, f"{text}: {why}."))
         if allowed.returncode:

@@ -1078,11 +1078,23 @@ def test_no_unit_restarts_that_could_not_start_or_must_not(home: Home, r1: Robot
     done = r1.round()
     assert done.restart == done.waiting == NAMES and not r1.systemctl
     (r1.folder / "enclaves/r1/a/key.pem").unlink()
+    r1.settings = replace(r1.settings, restart_if=("/no/command",))
+    why = "did not start or end: [Errno 2] No such file or directory: '/no/command'."
+    assert any(problem.endswith(why) for problem in r1.round().problems)
     r1.settings = replace(r1.settings, restart_if=("true",))
     done = r1.round()
     assert r1.systemctl == ["c.service", "sros@r1-b.service"]
     assert any("a.service is not restarted" in problem for problem in done.problems)
     assert not done.waiting
+
+
+def test_what_systemctl_says_is_printed_as_it_is(tmp_path: Path) -> None:
+    """But no character that a terminal obeys, and that no message may have."""
+    command = tmp_path / "systemctl"
+    command.write_text("#!/bin/sh\nprintf \"See 'status a' [1].\\n\\033[2J\" >&2; exit 1\n")
+    command.chmod(0o755)
+    with pytest.raises(UnavailableError, match=r"failed\. See 'status a' \[1\]\. \?\[2J\.\Z"):
+        Systemd((str(command),)).restart("a.service")
 
 
 def test_what_is_wrong_with_processes_is_confirmed(r1: Robot) -> None:
