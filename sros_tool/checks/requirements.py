@@ -98,9 +98,9 @@ HOLDS_ALONE = FindingKind(
     "policy of a package, and only the policies of the package's users have the enclaves that "
     "could break the requirement.",
     "The requirements file.",
-    "If this is the policy of a package, also check a policy that has other enclaves: `sros check "
-    "ROBOT_POLICY --requirements FILE --namespace NS`. If it is the policy of a whole robot, "
-    "check it with `--namespace /`: sros then warns if the name was probably changed.",
+    "For the policy of a package, also check the policy of a robot with further enclaves: `sros "
+    "check ROBOT_POLICY --requirements FILE --namespace NS`. For the policy of a whole robot, add "
+    "`--namespace /`: then sros warns if a name was probably changed.",
     prominent=True,
 )
 NOT_CROSSING = FindingKind(

@@ -325,7 +325,7 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
     assert len(found.holding_alone) == 1 and not (found.violations or found.vacuous)
     (finding,) = decided_findings(found, robot(PACKAGE))
     assert finding.id == ALONE and "enclave" in finding.text
-    assert "this is the policy of a package" in finding.remedy
+    assert "For the policy of a package" in finding.remedy
     (finding,) = decided_findings(found, replace(robot(PACKAGE), is_keystore=True))
     assert finding.remedy.startswith("No enclave of this keystore can break the requirement")
     users = (replace(found.holding_alone[0][0], elsewhere=None), found.holding_alone[0][1])
