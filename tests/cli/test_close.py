@@ -638,7 +638,9 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     elsewhere = sros("env", root, "/talker", "--domain", "5", cwd=robot.folder).err
     add = "add the domain to its keystore, with `sros update_keystore robot/keystore --domain 0,5"
     assert add in elsewhere
-    forbids = r"robot/requirements\.toml:\d+ forbids this: only /talker may publish /chatter\n  remedy .*\n$"
+    forbids = (
+        r"requirements\.toml:\d+ forbids this: only /talker may publish /chatter\n  remedy .*\n$"
+    )
     for source in (root, "robot/policy.xml"):
         asked = "explain", source, "/listener", "publish", "/chatter"
         denied = sros(*asked, cwd=robot.folder).out
