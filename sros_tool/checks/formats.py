@@ -55,16 +55,18 @@ def folded_findings(
     robot.
     """
     similar_groups: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
-    for group, other_robots in _merge_robots(groups, fleet):
-        kind = group if other_robots else _key_without_enclave(group)
-        similar_groups.setdefault(kind, []).append((group, other_robots))
+    for group, other_robots, robots in _merge_robots(groups, fleet):
+        key = (_key_without_enclave(group), other_robots, robots)
+        similar_groups.setdefault(key, []).append((group, other_robots))
     for members in similar_groups.values():
-        first, *more = members
+        (first, other_robots), *more = members
         if len(more) < _FEWEST_ENCLAVES:
             yield from members
         else:
             names = first_few([group[0].subject for group, _ in more], _MOST_ROBOTS, joint=", and ")
-            yield first[0], f"the same for {counted(len(more), 'more enclave')}: {names}"
+            text = f"the same for {counted(len(more), 'more enclave')}"
+            together = f"{other_robots}; {text} of each robot" if other_robots else text
+            yield first, f"{together}: {names}"
 
 
 def _key_without_enclave(group: tuple[Finding, ...]) -> Hashable:
@@ -80,12 +82,12 @@ def _key_without_enclave(group: tuple[Finding, ...]) -> Hashable:
 
 def _merge_robots(
     groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None
-) -> Iterator[tuple[tuple[Finding, ...], str]]:
+) -> Iterator[tuple[tuple[Finding, ...], str, tuple[str, ...]]]:
     """Merge findings that differ only in one robot.
 
     Each group in ``groups`` has the findings with one cause; only groups of one finding are merged.
     Yields the first group of each merge, with a text that names the robots of the other groups (""
-    if there are none).  A finding that names several robots is merged by the robot with which most
+    if there are none), and with the names of all robots of the merge.  A finding that names several robots is merged by the robot with which most
     findings become one.  If more than `_MOST_SIMILAR` merges differ only in the other robots that
     they name, these become one merge, too.  Without ``fleet``, nothing is merged.
     """
@@ -100,9 +102,9 @@ def _merge_robots(
             count = counted(len(others), "more robot")
             names = first_few(list(of_robot)[1:], _MOST_ROBOTS, joint=", and ")
             text = f"similar for {count} (with other names)" if many else f"the same for {count}"
-            yield first, f"{text}: {names}"
+            yield first, f"{text}: {names}", tuple(of_robot)
         else:
-            yield from ((alone, "") for alone in (first, *more))
+            yield from ((alone, "", ()) for alone in (first, *more))
 
 
 _MOST_ROBOTS = 10

@@ -225,6 +225,22 @@ def test_findings_that_also_differ_in_other_robots_are_one_if_they_are_many() ->
     ]
 
 
+def test_findings_on_several_enclaves_of_each_robot_are_one() -> None:
+    """But not if one of the enclaves has no finding on one of the robots."""
+    robots = [f"r{number}" for number in range(13)]
+    fleet = Fleet.of([Robot(name, f"/{name}") for name in robots])
+    pairs = [(robot, part) for part in ("a", "b", "c") for robot in robots]
+
+    def told(chosen: list[tuple[str, str]]) -> list[str]:
+        found = ((VIOLATED.found(f"/{r}/{part}", f"/{r}/{part} may not"),) for r, part in chosen)
+        return [f"{group[0].subject} {others}" for group, others in folded_findings(found, fleet)]
+
+    (text,) = told(pairs)
+    assert text.startswith("/r0/a the same for 12 more robots: r1, ")
+    assert text.endswith("and 2 more; the same for 2 more enclaves of each robot: /r0/b, /r0/c")
+    assert len(told([pair for pair in pairs if pair not in {("r11", "a"), ("r12", "b")}])) == 3
+
+
 def test_a_review_is_folded(tmp_path: Path) -> None:
     change = Change(tmp_path)
     wide = policy_text(
