@@ -87,9 +87,10 @@ def _merge_robots(
 
     Each group in ``groups`` has the findings with one cause; only groups of one finding are merged.
     Yields the first group of each merge, with a text that names the robots of the other groups (""
-    if there are none), and with the names of all robots of the merge.  A finding that names several robots is merged by the robot with which most
-    findings become one.  If more than `_MOST_SIMILAR` merges differ only in the other robots that
-    they name, these become one merge, too.  Without ``fleet``, nothing is merged.
+    if there are none), and with the names of all robots of the merge.  A finding that names several
+    robots is merged by the robot with which most findings become one.  If more than `_MOST_SIMILAR`
+    merges differ only in the other robots that they name, these become one merge, too.  Without
+    ``fleet``, nothing is merged.
     """
     read = []
     for group in groups:

@@ -916,8 +916,8 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     if numbers and (trusting := status.trusting_replaced):
         until_clause = f" (until {until:%Y-%m-%d})" if (until := status.revoked_until) else ""
         yield (
-            f"no certificate of the present CA is revoked, but {first_few(trusting, 5)} may still "
-            f"trust a replaced CA, and accept its revoked certificates{until_clause}"
+            f"{first_few(trusting, 5)} may still trust a replaced CA, and accept its revoked "
+            f"certificates{until_clause}; the present CA has no revoked certificates"
         )
     elif numbers:
         in_force, robots = numbers
@@ -928,8 +928,9 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         text += f" (not on {first_few(missing, 3)})" if in_force and missing else ""
         if waiting := sum(robot.has_list for robot in lacking):
             have = "have" if waiting > 1 else "has"
-            text += f"; {waiting} more {have} the list, but perhaps not all processes there "
-            text += "have loaded it and the current CAs"
+            who = f"{waiting} of these {len(lacking)} robots" if len(lacking) > 1 else missing[0]
+            text += f"; {who} {have} the list, but perhaps not all processes there have loaded it "
+            text += "and the current CAs"
         if shared := [robot.robot for robot in lacking if robot.has_shared_keys]:
             text += (
                 f"; two computers seem to have the keys of {first_few(shared, 3)}, so sros does "

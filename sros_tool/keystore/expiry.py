@@ -24,10 +24,7 @@ from sros_tool.validity import Window, iso, parse_duration, time_of_file
 from sros_tool.wording import counted, first_few
 
 IF_EXPIRED = "If files that processes loaded have expired, restart all processes together."
-ONE_BY_ONE = (
-    "restart the processes one by one; restarted processes communicate with all others whose "
-    f"loaded files are still valid. {IF_EXPIRED}"
-)
+ONE_BY_ONE = f"restart the processes one by one; meanwhile, all of them communicate. {IF_EXPIRED}"
 """Text on restarting processes one by one, or together if they loaded files that have expired.
 
 A process that loaded expired files communicates, if at all, only with peers that it met before;
