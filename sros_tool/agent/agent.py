@@ -942,6 +942,7 @@ class _Round:
             restart=restart,
             boot=_boot_digest(self._settings.robot, self._machine.boot()),
             crl_restart=None if crl_restart == restart else crl_restart,
+            waiting=self._state.waiting or None,
             sequence=sequence,
             release=self._state.release,
             expiry={name: _enclave_expiry(opened_enclaves.get(name)) for name in names},

@@ -1370,6 +1370,9 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     if unseen := [name for name in robot.restart or () if name not in seen]:
         names = first_few(unseen, _MOST_GROUPS)
         yield f"not known whether processes of {names} have loaded the installed files"
+    if robot.waiting:
+        names = first_few(robot.waiting, _MOST_GROUPS)
+        yield f"its agent restarts {names} once the command of --restart-if exits with 0"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"its CA files are from the stage '{robot.stage}' of the rotation"
     if late:

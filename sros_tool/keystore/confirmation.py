@@ -74,6 +74,7 @@ _REQUIRED_KEYS = {"format", "robot", "time", "files"}
 _AGENT_KEYS = (
     "boot",
     "crl_restart",
+    "waiting",
     "sequence",
     "release",
     "expiry",
@@ -194,6 +195,7 @@ class Confirmation:
     ``running`` maps enclaves to the files that their processes have loaded.  ``crl_restart`` are
     the enclaves in ``restart`` whose processes may lack the revocation list; None stands for all of
     them.  Processes of the remaining enclaves in ``restart`` lack only their own new documents.
+    ``waiting`` are the enclaves in ``restart`` whose units the agent restarts later by itself.
     ``boot`` is a SHA-256 that changes with each start of the computer.  ``problems`` are short
     sentences, and ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the
     newest revocation list (PEM) of each identity CA on the robot, if they may differ from the lists
@@ -217,6 +219,7 @@ class Confirmation:
     requests: tuple[str, ...] | None = None
     crl: str | None = None
     crl_restart: tuple[str, ...] | None = None
+    waiting: tuple[str, ...] | None = None
     boot: str | None = None
     seal: str | None = None
 
@@ -802,7 +805,7 @@ def _confirmation_from(value: Any) -> Confirmation:
 
 def _restart_from(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list):
-        raise _FormError('"restart" or "crl_restart" is not a list')
+        raise _FormError('"restart", "crl_restart" or "waiting" is not a list')
     return tuple(sorted(set(map(_enclave_from, value))))
 
 
@@ -919,6 +922,7 @@ _AGENT_READERS: Mapping[str, Callable[[Any], Any]] = {
     "requests": _requests_from,
     "crl": _crl_from,
     "crl_restart": _restart_from,
+    "waiting": _restart_from,
     "boot": _boot_from,
     "seal": _seal_from,
 }

@@ -212,7 +212,7 @@ class ConfirmedFile:
 @shows(
     *("robot", "state", "to_do", "enclaves", "revoked", "unrecorded", "sharing_name", "confirmed"),
     *("received", "clock", "fetches", "release", "published", "stage", "files", "pending"),
-    *("restart", "running", "crl_in_force"),
+    *("restart", "waiting", "running", "crl_in_force"),
     *("expiry", "dds", "problems", "notes"),
     null_if_empty=("stage",),
 )
@@ -287,6 +287,10 @@ class RobotStatus:
     """The enclaves whose processes may still run with earlier files on the robot, by its last
     confirmation, including enclaves that the robot should no longer have; null if the confirmation
     does not tell.
+    """
+    waiting: tuple[str, ...]
+    """Enclaves of ``restart`` whose units the robot's agent restarts by itself, in the first round
+    in which the command of ``--restart-if`` exits with 0, by its last confirmation.
     """
     running: Mapping[str, RunningFiles] | None
     """The files that the processes of each enclave of the robot have loaded, by its last
@@ -852,6 +856,11 @@ class _ComparedRobot(NamedTuple):
             return None
         earlier = {name for name, files in (running or {}).items() if files == RunningFiles.EARLIER}
         return tuple(sorted(earlier.union(due or ())))
+
+    def waiting(self) -> tuple[str, ...]:
+        """Return the enclaves of `restart` whose units the robot's agent restarts by itself."""
+        waiting = (self.confirmed and self.confirmed.waiting) or ()
+        return tuple(name for name in self.restart() or () if name in waiting)
 
     def crl_restart(self) -> tuple[str, ...] | None:
         """Return the enclaves whose processes may lack the revocation list; None if not reported.
@@ -1651,6 +1660,7 @@ def _robot_status(
         files=facts.files(),
         pending=facts.different,
         restart=compared_robot.restart(),
+        waiting=compared_robot.waiting(),
         running=compared_robot.running(),
         crl_in_force=facts.has_list and facts.is_restarted if needs_list else None,
         expiry={kind: file.window.not_after for kind, file in validity.items()},

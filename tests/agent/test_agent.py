@@ -1076,7 +1076,7 @@ def test_no_unit_restarts_that_could_not_start_or_must_not(home: Home, r1: Robot
     r1.started = dict.fromkeys(NAMES, moment() - timedelta(hours=1))
     r1.release = home.revoked
     done = r1.round()
-    assert done.restart == done.waiting == NAMES and not r1.systemctl
+    assert done.restart == done.waiting == r1.message().waiting == NAMES and not r1.systemctl
     (r1.folder / "enclaves/r1/a/key.pem").unlink()
     r1.settings = replace(r1.settings, restart_if=("/no/command",))
     why = "did not start or end: [Errno 2] No such file or directory: '/no/command'."
@@ -1085,7 +1085,7 @@ def test_no_unit_restarts_that_could_not_start_or_must_not(home: Home, r1: Robot
     done = r1.round()
     assert r1.systemctl == ["c.service", "sros@r1-b.service"]
     assert any("a.service is not restarted" in problem for problem in done.problems)
-    assert not done.waiting
+    assert not done.waiting and r1.message().waiting is None
 
 
 def test_what_systemctl_says_is_printed_as_it_is(tmp_path: Path) -> None:

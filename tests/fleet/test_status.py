@@ -1296,6 +1296,10 @@ def test_robots_that_differ_in_their_names_share_a_line(field: Field) -> None:
     ]
     field.send("r2", running={"/r2/base": RunningFiles.CURRENT})
     assert text.format(robot="r1") in field.run("fleet", "status", "ks", status=1).out
+    field.send("r1", restart=["/r1/base"], waiting=["/r1/base", "/r1/other"])
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert "; its agent restarts /r1/base once the command of --restart-if exits with 0" in said
+    assert field.status()["robots"]["r1"]["waiting"] == ["/r1/base"]
 
 
 def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field: Field) -> None:

@@ -103,6 +103,7 @@ VALID: dict[str, Any] = {
     "certificates": {PATH: [DIGEST]},
     "restart": ["/r7"],
     "crl_restart": [],
+    "waiting": ["/r7"],
     "boot": DIGEST,
     "dds": DDS,
     "sequence": 7,
@@ -116,6 +117,7 @@ VALID: dict[str, Any] = {
 OF_AGENT = (
     "boot",
     "crl_restart",
+    "waiting",
     "sequence",
     "release",
     "expiry",
@@ -169,7 +171,7 @@ def hostile() -> list[tuple[str, bytes]]:
             {"enclaves/r7/permissions.p7s": [DIGEST]}, {"enclaves/r8/cert.pem": [DIGEST]},
         ),
         **dict.fromkeys(
-            ("restart", "crl_restart"),
+            ("restart", "crl_restart", "waiting"),
             ({}, None, "/r7", [1], [[]], [""], ["r7"], ["/r7/.."], [CONTROLS]),
         ),
         "dds": (
@@ -227,7 +229,7 @@ def test_a_hostile_confirmation_is_refused_in_one_paragraph() -> None:
         "as earlier versions write it"
     )
     assert not any(getattr(without, key) for key in OF_AGENT)
-    for later in ({"dds", *OF_AGENT}, {"boot", "crl_restart"}):  # than 0.2.0, than 0.3.0
+    for later in ({"dds", *OF_AGENT}, {"boot", "crl_restart", "waiting"}):  # than 0.2.0, than 0.3.0
         earlier = {key: value for key, value in VALID.items() if key not in later}
         assert json.loads(render_confirmation(parse_confirmation(_json(earlier), "it"))) == earlier
     with pytest.raises(DocumentError, match="later release of sros, update sros here first"):
