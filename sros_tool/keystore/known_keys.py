@@ -45,6 +45,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
 from sros_tool.validity import iso, parse_iso
+from sros_tool.wording import serial_text
 
 
 def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certificate) -> str:
@@ -675,8 +676,8 @@ def keys_on_robots_remedy(root: Path, names: Sequence[str]) -> str:
 
 def _key_and_description(certificate: x509.Certificate) -> tuple[str, str]:
     """Return the digest of a certificate's key, and a description of the certificate."""
-    subject = subject_text(certificate.subject)
-    return _key_digest_of(certificate), f"certificate {certificate.serial_number:x} of {subject}"
+    subject, serial = subject_text(certificate.subject), serial_text(certificate.serial_number)
+    return _key_digest_of(certificate), f"certificate {serial} of {subject}"
 
 
 def _key_digest_of(certificate: x509.Certificate) -> str:

@@ -257,7 +257,7 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     others = 4711  # of another site
     before = snapshot(site)
     for crl, words in (
-        (b"", rf"only this service signs .*: {serial:x}. Give the list of the service with"),
+        (b"", rf"only this service signs .*: {serial_text(serial)}. Give the list of the service "),
         (listed(others), f"It does not revoke {serial_text(serial)}"),
         (listed(serial, key=OTHER), "did not sign it"),
         (listed(serial, days=-1), "not now"),
