@@ -20,7 +20,7 @@ from sros_tool.policy.merge import merge_into
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy
 from sros_tool.policy.node_basics import NodeRights
 from sros_tool.policy.patterns import overlap
-from sros_tool.policy.rights import Right, Rules, policy_rights
+from sros_tool.policy.rights import Right, Rules, is_of_one_node, policy_rights
 from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import Requirement, RightsRequirement, read_requirements
 from sros_tool.proof.suggestions import names_to_protect, suggest
@@ -165,6 +165,7 @@ def ordinary_uses(policy: Policy, folder: Path) -> set[tuple[str, str, str]]:
         for enclave in policy.enclaves
         for profile in enclave.all_profiles()
         for right in common.included_rights(parts, profile.ns, profile.node)
+        if is_of_one_node(right.name)
     }
 
 

@@ -41,6 +41,7 @@ from sros_tool.policy.rights import (
     Right,
     Rules,
     group_rights,
+    is_of_one_node,
     join_actions,
     order,
     parts,
@@ -514,7 +515,7 @@ def _common_rights_of_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterat
         for group in common:
             for name in group.names:
                 fqn = expand(name, profile.ns, profile.node)
-                for right, _ in group.rights:
+                for right, _ in group.rights if is_of_one_node(fqn) else ():
                     yield Right(enclave.path, ALLOW, right, fqn)
 
 

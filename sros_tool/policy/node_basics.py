@@ -11,10 +11,8 @@ from sros_tool.names import NODE_SERVICES, PARAMETER_SERVICES, is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import Names
-from sros_tool.policy.rights import Right, Rules, policy_rights, split_actions
+from sros_tool.policy.rights import Right, Rules, is_of_one_node, policy_rights, split_actions
 
-_ANY_NODE = "/*"
-"""The name that stands for every node, in the rights of an enclave without a policy."""
 _SERVICES_WITHOUT_PARAMETERS = {"get_type_description"}
 """The services of a node without parameters."""
 
@@ -35,8 +33,7 @@ class NodeRights:
 
     The services of a node count only if the enclave may serve all of them, and no other enclave may
     serve any of them.  The reason is that a process with such a right can pose as another enclave's
-    node.  The comparison leaves out a right to serve the services of nodes with any name, which
-    enclaves without a policy have.
+    node.  For the same reason, a right with a wildcard in place of the node does not count.
     """
 
     def __init__(self, rights: Iterable[Right]) -> None:
@@ -46,15 +43,12 @@ class NodeRights:
             if (right.qualifier, right.right) != (ALLOW, "reply"):
                 continue
             node, _, service = right.name.rpartition("/")
-            if service in NODE_SERVICES:
+            if service in NODE_SERVICES and is_of_one_node(right.name):
                 served[right.enclave, node].add(service)
-            if node != _ANY_NODE:
-                enclaves[right.name].add(right.enclave)
+            enclaves[right.name].add(right.enclave)
         wild = Names(sorted(filter(is_expression, enclaves)))
 
         def is_alone(enclave: str, node: str, services: set[str]) -> bool:
-            if node == _ANY_NODE:
-                return True
             # Nodes without parameters, such as those of tf2_ros, can have the same name in many
             # processes.
             compared = (
@@ -76,8 +70,8 @@ class NodeRights:
         node, _, service = right.name.rpartition("/")
         if right.qualifier is not ALLOW:
             return False
-        if right.right == "reply" and service in NODE_SERVICES:
-            return (right.enclave, node) in self._own
+        if right.right == "reply":
+            return service in NODE_SERVICES and (right.enclave, node) in self._own
         return _basics().cover(right._replace(enclave="/"))
 
 

@@ -7,6 +7,7 @@ parts, `join_actions` joins the parts again.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import chain
@@ -385,6 +386,7 @@ CHANGING_NODES = (
     "_sros_observer_",
 )
 """Beginnings of node names that end with an address or process id, which changes at every start."""
+_CHANGING_NODE = re.compile(r"(?:/[^/*?\[]+)*/(?:" + "|".join(CHANGING_NODES) + r")\*")
 _SERVED_BY_EVERY_NODE = frozenset(f"~/{service}" for service in NODE_SERVICES)
 
 
@@ -432,6 +434,16 @@ def node_of(profile: Profile) -> NodeName:
     ns = profile.ns.strip("/")
     # A namespace that begins with a wildcard does not need a "/" before it.
     return NodeName(ns if ns.startswith("*") else f"/{ns}", profile.node)
+
+
+def is_of_one_node(name: str) -> bool:
+    """Return whether a name, such as of a service, has no wildcard in place of its node.
+
+    Only a node of `CHANGING_NODES` has one.  With any other wildcard, an enclave can pose as nodes
+    of other enclaves.
+    """
+    node = name.rpartition("/")[0]
+    return not is_expression(node) or bool(_CHANGING_NODE.fullmatch(node))
 
 
 def _offers_node_services(group: Group) -> bool:

@@ -16,6 +16,7 @@ import pytest
 
 from benchmarks.inputs import enclaves_policy, topics_policy
 from sros_tool.files import policies_dir, replace_file
+from sros_tool.names import NODE_SERVICES
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from tests.support.harness import policy_text, publish, snapshot, sros, subscribe, with_includes
@@ -56,6 +57,22 @@ def test_a_merge_counts_what_every_node_needs_and_notes_a_shared_enclave(folder:
     assert "note [merge.several-instances]: /a has the node n in /, /left: " in said[3]
     found = sros("check", "a.xml", "left.xml", "--include", "policy.several-instances").ok().err
     assert "nothing found (not shown: 1 note" in found
+
+
+@pytest.mark.parametrize("node", ["*", "a*", "?", "_ros2cli_*"])
+def test_only_a_right_of_one_node_is_one_that_every_node_needs(folder: Path, node: str) -> None:
+    """By a wildcard, /light can pose as any node; only a tool's name ends with a process id."""
+    served = "".join(f"<service>~/{service}</service>" for service in NODE_SERVICES)
+    basics = f'{publish("/rosout")}<services reply="ALLOW">{served}</services>'
+    text = policy_text({"/light": basics}).replace('node="n"', f'node="{node}"')
+    (folder / "light.xml").write_text(text)
+    said = sros("merge_policy", "a.xml", "light.xml", "-o", "o.xml").ok().err
+    drawn = sros("view", "o.xml", "--format", "markdown").ok().out
+    is_one = node == "_ros2cli_*"
+    assert f"  and {'8 rights' if is_one else '1 right'} that every node needs" in said
+    for service in NODE_SERVICES:
+        assert (f"/light ALLOW reply service /{node}/{service}\n" in said) is not is_one
+        assert (f"/{node}/{service}`" in drawn) is not is_one
 
 
 def test_a_merge_notes_an_enclave_that_gets_nodes_of_another_policy(folder: Path) -> None:

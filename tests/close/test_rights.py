@@ -43,6 +43,14 @@ def test_all_who_may_move_the_robot_are_shown_first(tmp_path: Path) -> None:
     assert lines[-1] == "and 13 more lines"
 
 
+def test_a_right_to_pose_as_every_node_is_shown(tmp_path: Path) -> None:
+    for node, shown in (("n", []), ("*", ["service /*/set_parameters: nobody -> /a"])):
+        served = '<services reply="ALLOW"><service>~/set_parameters</service></services>'
+        text = policy_text({"/a": publish("/rosout") + served})
+        (tmp_path / "p.xml").write_text(text.replace('node="n"', f'node="{node}"'))
+        assert access_lines(read_policy(tmp_path / "p.xml"), tmp_path) == shown
+
+
 def test_what_tells_most_is_shown_before_parameter_services(tmp_path: Path) -> None:
     """A misspelled name has nobody at its other end; a parameter client calls six services."""
 

@@ -23,10 +23,10 @@ COMMON = (
 )
 
 
-def policy(groups: str, more: str = "") -> Policy:
+def policy(groups: str, more: str = "", node: str = "n") -> Policy:
     text = (
         '<policy version="0.2.0"><enclaves><enclave path="/a"><profiles>'
-        f'<profile ns="/ns" node="n">{groups}</profile>'
+        f'<profile ns="/ns" node="{node}">{groups}</profile>'
         f"</profiles></enclave>{more}</enclaves></policy>"
     )
     return read_policy(Path("/nowhere/a.xml"), text.encode())
@@ -218,6 +218,11 @@ def test_the_ratio_counts_known_names() -> None:
 def test_what_every_node_needs_is_known() -> None:
     found = use(policy(group("topics", "/*", "publish")), "publish /x", common=COMMON)
     assert (found.allowed, found.observed, found.remaining) == (2, 1, 2)
+    groups = group("topics", "/rosout /x", "publish")
+    groups += group("services", "~/get_parameters", "reply")
+    for node, kept in (("n", 2), ("_ros2cli_*", 2), ("*", 1)):
+        found = use(policy(groups, node=node), "publish /x", common=COMMON)
+        assert (len(found.kept_for_every_node), len(found.never_observed)) == (kept, 2 - kept)
 
 
 def test_wildcards_of_services_and_topics_count_known_actions() -> None:
