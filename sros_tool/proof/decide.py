@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.names import (
+    ACTION_SEPARATOR,
     ROS_DISCOVERY_TOPIC,
     SERVICE_ENDS,
     dds_names,
@@ -858,7 +859,7 @@ def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) ->
 
     A name waits for users if an enclave has its other side, such as the server of a service.  The
     name is gone instead if it lacks its server, or if an enclave that an `Only` lists by its exact
-    name exists: this enclave probably had the right under the earlier name.
+    name has the right to another name without another side: this is probably the new name.
 
     A name that no right states can still be used by a wildcard, and `Nobody` demands that nobody
     uses it.  So such a name counts as unused only if a right states another name that differs by
@@ -866,9 +867,6 @@ def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) ->
     action).
     """
     result = _UnusedNames([], [], [], [], [], [])
-    is_listed = isinstance(requirement, Only) and any(
-        name in world.enclaves for name in requirement.enclaves
-    )
     for right, name, parts in _restricted_names(requirement):
         if isinstance(requirement, Protected) and name == "/*":  # also of a kind without names yet
             continue
@@ -889,7 +887,9 @@ def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) ->
             elif not _is_used_by_anybody(world, _sufficient_parts(peer), name, limit):
                 result.unused.append(f"no enclave may {verb} or {peer} {named}")
             elif known:
-                is_gone = is_listed or verb in ("reply", "execute")
+                is_gone = verb in ("reply", "execute") or _has_unanswered_name(
+                    requirement, name, world, parts
+                )
                 clauses = result.gone if is_gone else result.waiting
                 clauses.append(f"no enclave may {verb} {named}")
             else:
@@ -911,6 +911,28 @@ def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) ->
         else:
             result.unserved.append(f"{_CLAUSES_WITHOUT_PEER[verb]} {named}")
     return result
+
+
+def _has_unanswered_name(
+    requirement: Requirement, name: str, world: World, parts: Iterable[_TopicOfRight]
+) -> bool:
+    """Return whether an enclave that an `Only` lists has a name without a stated other side.
+
+    This may be the new name for ``name``.  Wildcards are no other side, such as the wildcard of a
+    recorder.
+    """
+    listed = {*requirement.enclaves} if isinstance(requirement, Only) else set()
+    for part in parts if listed else ():
+        others = world.side(not part.writes).exact
+        for topic, enclaves in world.side(part.writes).exact.items():
+            if topic in others or listed.isdisjoint(enclaves):
+                continue
+            if topic.startswith(part.begin) and topic.endswith(part.end):
+                own = topic[len(part.begin) : len(topic) - len(part.end)]
+                is_alike = is_of_every_node(own) == is_of_every_node(name)
+                if is_alike and ACTION_SEPARATOR not in own:
+                    return True
+    return False
 
 
 def _similar_served_name(world: World, right: str, name: str, limit: SearchLimit) -> str | None:

@@ -177,7 +177,7 @@ class Decisions:
     state.  ``blocked`` are requirements that hold, with a use that does not pass between Zenoh
     routers. ``unnamed`` are requirements that hold, with their names that no right
     states.  ``unjudged`` are enclaves that have to have rights, but that an export
-    lacks.  ``holding_alone`` are requirements with relative names that only further enclaves could
+    lacks.  ``holding_alone`` are requirements that only further enclaves could
     break, with the reasons.  ``absent`` are requirements with exceptions for enclaves that do not
     exist, with clauses on these exceptions. ``misspelled`` are the same, if an enclave with a
     similar name exists. ``unanswered`` are requirements about names of which enclaves have only one
@@ -248,14 +248,15 @@ def decide_all(
             violations.append(
                 Violation(requirement, witness, steps, titles, missing, idle, other_steps)
             )
-        empty, reasons = _why_never_fails([verdict for _, verdict in verdicts])
-        if empty or reasons:
-            is_complete = not lacks_enclaves and _has_all_enclaves(requirement, system)
-            is_gone = is_complete and _texts_in_all(verdict.gone for _, verdict in verdicts)
-            if empty or is_gone or not _users_may_break(requirement):
-                vacuous.append((requirement, (*empty, *reasons)))
-            elif not broken:
-                holding_alone.append((requirement, tuple(reasons)))
+        empty, waiting, always = _why_never_fails([verdict for _, verdict in verdicts])
+        is_complete = not lacks_enclaves and _has_all_enclaves(requirement, system)
+        is_gone = (is_complete or not requirement.is_relative) and _texts_in_all(
+            verdict.gone for _, verdict in verdicts
+        )
+        if empty or is_gone or (always and not _users_may_break(requirement)):
+            vacuous.append((requirement, (*empty, *(waiting or always))))
+        elif (waiting or always) and not broken:
+            holding_alone.append((requirement, (*(waiting or always),)))
         if not broken and not lacks_enclaves:
             failing, alone = _unanswered_clauses(requirement, system, [v for _, v in verdicts])
             if failing:
@@ -361,18 +362,22 @@ def _step(requirement: Requirement, use: Use, world: World, system: System) -> S
     return Step(use, system.places.find(stating), holder)
 
 
-def _why_never_fails(verdicts: Sequence[Verdict]) -> tuple[list[str], list[str]]:
+def _why_never_fails(verdicts: Sequence[Verdict]) -> tuple[list[str], list[str], list[str]]:
     """Return clauses that say why a requirement, or a part of it, cannot fail in any world.
 
     The first list is about enclaves that do not exist, and about names that no enclave may use. The
-    second list has the other reason: names of which enclaves have only one side, or else a clause
-    that holds whatever rights enclaves get.
+    second list is about names of which enclaves have only the other side.  The third list has a
+    clause that holds whatever rights enclaves get.
     """
-    empty = _texts_in_all(verdict.empty for verdict in verdicts)
-    reasons = [verdicts[0].always] if all(verdict.always for verdict in verdicts) else []
-    if waiting := _texts_in_all((*verdict.gone, *verdict.waiting) for verdict in verdicts):
-        reasons = [_listed_clauses(waiting)]
-    return [_listed_clauses(empty)] if empty else [], reasons
+    empty, waiting = (
+        [_listed_clauses(clauses)] if clauses else []
+        for clauses in (
+            _texts_in_all(verdict.empty for verdict in verdicts),
+            _texts_in_all((*verdict.gone, *verdict.waiting) for verdict in verdicts),
+        )
+    )
+    always = [verdicts[0].always] if all(verdict.always for verdict in verdicts) else []
+    return empty, waiting, always
 
 
 def _listed_clauses(clauses: Iterable[str]) -> str:
@@ -787,7 +792,10 @@ def _by_name_finding(requirement: Only, patterns: Sequence[str], steps: Sequence
 def _alone_remedy(
     holding_alone: Iterable[tuple[Requirement, tuple[str, ...]]], system: System
 ) -> str:
-    if not any(_has_all_enclaves(requirement, system) for requirement, _ in holding_alone):
+    if not any(
+        _has_all_enclaves(requirement, system) or not requirement.is_relative
+        for requirement, _ in holding_alone
+    ):
         return ""
     what = "keystore" if system.is_keystore else "robot"
     return (

@@ -320,7 +320,7 @@ PACKAGE = {**ROBOT, "/r/c": may("publish", "/z") + SERVED}
     ],
 )
 def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required: str) -> None:
-    """Twin: with the absolute names of a robot, it protects nothing."""
+    """So may one with the absolute names of a robot, unless no enclave is left to restrict."""
     found = decided(PACKAGE, required)
     assert len(found.holding_alone) == 1 and not (found.violations or found.vacuous)
     (finding,) = decided_findings(found, robot(PACKAGE))
@@ -332,7 +332,10 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
     (finding,) = decided_findings(replace(found, holding_alone=(users,)), robot(PACKAGE))
     assert finding.remedy.startswith("No enclave of this robot can break the requirement")
     of_robot = decided(PACKAGE, re.sub(r'"([a-z])', r'"/\1', required))
-    assert len(of_robot.vacuous) == 1 and not of_robot.holding_alone
+    is_vacuous = '"/r/*"' in required or "= 3" in required
+    assert (len(of_robot.vacuous), len(of_robot.holding_alone)) == (is_vacuous, not is_vacuous)
+    remedies = [each.remedy for each in decided_findings(of_robot, robot(PACKAGE))]
+    assert is_vacuous or any(of.startswith("No enclave of this robot can") for of in remedies)
 
 
 OWN = "//op/* allows this to /op/b"
@@ -407,7 +410,8 @@ VACUOUS, VIOLATED = "requirement.vacuous", "requirement.violated"
             '[[only]]\npublish = ["x"]\nrequest = ["reset"]\nenclaves = ["/o", "/p"]',
             {ABSENT, VIOLATED},
         ),
-        ('[[only]]\nrequest = ["/reset"]\nenclaves = ["/ops"]', {ABSENT, VACUOUS}),
+        ('[[only]]\nrequest = ["/reset"]\nenclaves = ["/ops"]', {ABSENT, ALONE}),
+        ('[[only]]\nrequest = ["/rest"]\nenclaves = ["/ops"]', {ABSENT, VACUOUS}),
         ('[[only]]\npublish = ["/x"]\nenclaves = ["/r/a", "/rr/a"]', {MISSPELLED}),
         ('[[only]]\npublish = ["/x"]\nenclaves = ["*", "!/ops"]', {VACUOUS}),
         ('[[apart]]\nfrom = ["/r/c"]\nto = ["/r/b"]\nthrough = ["/gate"]', {ABSENT}),
@@ -563,18 +567,20 @@ def test_a_requirement_about_a_name_without_another_side(
 @pytest.mark.parametrize("right", ["publish", "subscribe", "request", "reply", "call", "execute"])
 @pytest.mark.parametrize(
     ("listed", "is_gone"),
-    [("/a", True), ("//panel", True), ('/op", "/*', False)],
+    [("/a", True), ("//panel", True), ("//idle", False), ('/op", "/*', False)],
 )
 def test_a_right_that_nobody_has_any_more_on_a_robot(
     right: str, listed: str, is_gone: bool
 ) -> None:
     """After a rename, only the leftover peer has the earlier name. Twin: users may lack the right.
 
-    On a robot, a name without its server is always gone.
+    On a robot, a name without its server is always gone; another name is perhaps not the new name
+    of this one if it has its other side, or if every node has it.
     """
     peer = PEER_RIGHT[right]
-    kept = {"/n/b": may(peer, "/n/old"), "/panel": may("publish", "/odom")}
-    system = robot({**kept, "/n/a": may(right, "/n/new")})
+    idle = may("publish", "/rosout") + may(right, "/n/used") + may("request", "/b/get_parameters")
+    kept = {"/n/b": may(peer, "/n/old", "/n/used"), "/idle": idle}
+    system = robot({**kept, "/n/a": (new := may(right, "/n/new")), "/panel": new})
     toml = '[[only]]\n{} = ["{}"]\nenclaves = ["{}"]'
     of_n = toml.format(right, "old", listed).encode()
     at_n = parse_requirements(of_n, "r.toml", namespaces=["/n"])
@@ -592,6 +598,29 @@ def test_a_right_that_nobody_has_any_more_on_a_robot(
     assert found(at_n, replace(system, is_package=True)) == [ALONE]
     assert found(at_n, replace(system, is_export=True)) == [ALONE]
     assert not found(at_n, robot({**kept, "/n/a": may(right, "/n/old")}))
+
+
+@pytest.mark.parametrize("listed", ["//op/panel", "/gripper", "//op/nobody"])
+@pytest.mark.parametrize(
+    ("service", "ids"),
+    [("gripper/set_parameters", {ALONE}), ("grip/set_parameters", {VACUOUS})],
+)
+def test_a_service_that_nobody_may_request_is_protected(
+    service: str, ids: set[str], listed: str
+) -> None:
+    """A stranger breaks the requirement. Twin: of a node that does not exist, nothing is."""
+    rights = {
+        "/l/gripper": may("reply", "/l/gripper/set_parameters", "/l/gripper/release"),
+        "/op/panel": may("request", "/l/gripper/release"),
+    }
+    stranger = {"/stranger": may("request", f"/l/{service}")}
+    for name, namespaces in ((service, ["/l"]), (f"/l/{service}", ())):
+        enclave = listed if namespaces or listed[1] == "/" else f"/l{listed}"
+        toml = f'[[only]]\nrequest = ["{name}"]\nenclaves = ["{enclave}"]'.encode()
+        required = parse_requirements(toml, "r.toml", namespaces=namespaces)
+        found = {each.id for each in requirement_findings(required, robot(rights))}
+        assert found - {ABSENT} == ids
+        assert decide_all(required, robot(rights | stranger)).violations
 
 
 @pytest.mark.parametrize(
