@@ -12,7 +12,7 @@ a person decides.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Set
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -38,6 +38,7 @@ from sros_tool.names import (
     expand,
     expression_problem,
     is_expression,
+    namespace_problem,
     node_of_service,
     nodes_served,
     right_to_use,
@@ -52,6 +53,7 @@ from sros_tool.runtime.vendor_log import (
     denied_topic,
     labeled_line,
     log_lines,
+    logging_node,
     plain_text,
     security_directory,
 )
@@ -240,7 +242,8 @@ _NO_PROFILE_TEXT = (
 )
 _ASSUMED_NODE_TEXT = (
     "the log does not name the node, so sros takes the last part of the enclave's name as the "
-    "node's name; if this is wrong, name the node with --node /NAMESPACE/NAME: {}"
+    "node's name, in the namespace /; if this is wrong, name the node with --node "
+    "/NAMESPACE/NAME: {}"
 )
 _ALL_BASIC_RIGHTS_TEXT = (
     "a node needs all rights of these common parts, so all of them are proposed together, instead "
@@ -283,7 +286,15 @@ def learned_from_logs(
     denials = {log: read_denials(plain_text(text)) for log, text in logs.items()}
     missing = propose(denial for denied in denials.values() for denial in denied)
     common = common_parts(file.parent if file else policies_dir(), policies_dir())
-    learned = as_learned(missing, enclave, node, present, common, written=file is not None)
+    learned = as_learned(
+        missing,
+        enclave,
+        node,
+        present,
+        common,
+        written=file is not None,
+        logged_nodes=_logged_nodes(logs, denials),
+    )
     asked = {profile.enclave for profile in learned.profiles}
     lines = [
         DenialLine(
@@ -299,6 +310,22 @@ def learned_from_logs(
         if propose([denial]).rights and (denial.enclave or enclave) in asked
     ]
     return learned, lines, any(denials.values())
+
+
+def _logged_nodes(
+    logs: Mapping[Path, str], denials: Mapping[Path, Sequence[Denial]]
+) -> dict[str, set[str]]:
+    """Map each enclave ("" if unknown) to the nodes that logged in processes with denials."""
+    nodes: dict[str, set[str]] = {}
+    for log, text in logs.items():
+        enclaves: dict[str, set[str]] = {}
+        for denial in denials[log]:
+            enclaves.setdefault(denial.process, set()).add(denial.enclave)
+        for process, message in map(labeled_line, log_lines(plain_text(text))):
+            if process in enclaves and (node := logging_node(message)):
+                for enclave in enclaves[process]:
+                    nodes.setdefault(enclave, set()).add(node)
+    return nodes
 
 
 def lines_asking_for(added: Iterable[Right], lines: Iterable[DenialLine]) -> list[DenialLine]:
@@ -327,6 +354,7 @@ def as_learned(
     common: CommonParts | None = None,
     *,
     written: bool = False,
+    logged_nodes: Mapping[str, Collection[str]] | None = None,
 ) -> Learned:
     """Return the proposed rights as profiles.
 
@@ -334,10 +362,11 @@ def as_learned(
     enclave. ``node`` (namespace and name) names the profile. Without ``node``, the rights go to the
     node whose standard services were denied, else to the only profile of the enclave in ``policy``,
     else to a profile for any node: DDS checks only the enclave. If ``policy`` does not have the
-    enclave, the last part of its name is assumed to be the node's name, and a note says so. A node
-    that is not in the policy gets a note instead of rights. ``common`` are the rights that every
-    node needs. A node that has none of these rights gets all of them in two cases: one of these
-    rights was denied to the node, or the profile is new in a policy that is ``written``.
+    enclave, the last part of its name is assumed to be the node's name, in the namespace of the
+    only logger with this name in ``logged_nodes`` (full names by enclave), else in / with a note.
+    A node that is not in the policy gets a note instead of rights. ``common`` are the rights that
+    every node needs. A node that has none of these rights gets all of them in two cases: one of
+    these rights was denied to the node, or the profile is new in a policy that is ``written``.
 
     Raises:
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
@@ -353,8 +382,17 @@ def as_learned(
                 other_nodes[_full_name(profile)] = f"enclave {path} has {profile_names}"
                 continue
             if profile == _ANY_NODE and not present and path != "/":
-                profile = "/", path.rpartition("/")[2]
-                assumed[path] = _full_name(profile)
+                end = path[path.rindex("/") :]
+                logged = logged_nodes or {}
+                named = {*logged.get(path, ()), *logged.get("", ())}
+                fitting = [
+                    full_name
+                    for full_name in named
+                    if full_name.endswith(end) and not namespace_problem(full_name)
+                ]
+                profile = _profile_of_node(fitting[0] if len(fitting) == 1 else end, ())
+                if profile[0] == "/":  # perhaps the logger of a library
+                    assumed[path] = _full_name(profile)
             has = present.get(profile, frozenset())
             parts: tuple[str, ...] = ()
             if common:

@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import UsageError
-from sros_tool.explain.denials import Denial, MissingRights, as_learned, propose, read_denials
+from sros_tool.explain.denials import (
+    Denial,
+    MissingRights,
+    as_learned,
+    learned_from_logs,
+    propose,
+    read_denials,
+)
 from sros_tool.files import policies_dir
 from sros_tool.graph.learn import NodeRight, common_parts, groups_of
 from sros_tool.names import PARAMETER_SERVICES
@@ -241,12 +248,44 @@ WHOLE = replace(
 )
 
 
+DENIED = (
+    "2026-11-21 06:00:00.1 [SECURITY Error] rt/x topic not found in allow rule.\n"
+    "could not create publisher: denied"
+)
+
+
 def robot(*profiles: Profile) -> Policy:
     return Policy((Enclave("/robot", (Profiles(profiles),)),))
 
 
 def of(topic: str, direction: str = "subscribe") -> MissingRights:
     return propose([Denial(topic, direction)])
+
+
+@pytest.mark.parametrize(
+    ("loggers", "ns"),
+    [
+        (["left.dock"], "/left"),
+        (["left.dock", "rcl", "left.dock.tf", "left.station.dock2"], "/left"),
+        ([], ""),
+        (["dock"], ""),  # perhaps the logger of a library
+        (["left.dock", "right.dock"], ""),
+        (["left..dock"], ""),
+        (["left.docks"], ""),
+    ],
+)
+def test_the_namespace_of_a_new_node_is_that_of_its_logger(
+    loggers: list[str], ns: str, tmp_path: Path
+) -> None:
+    lines = ["Found security directory: /ks/enclaves/left/dock", DENIED]
+    lines += [f"[INFO] [1.2] [{logger}]: ready" for logger in loggers]
+    text = "\n".join([*lines, "[other-1] [INFO] [1.2] [x.dock]: ready"])
+    found, _, _ = learned_from_logs(
+        {tmp_path / "log": text}, file=None, enclave="", node=None, present=None
+    )
+    (profile,) = found.profiles
+    assert (profile.ns, profile.node) == (ns or "/", "dock")
+    assert [note.id for note in found.notes] == ["log.node-assumed"] * (not ns)
 
 
 def test_a_node_of_another_name_gets_nothing_and_is_told() -> None:
