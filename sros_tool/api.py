@@ -907,7 +907,8 @@ def check(
         robots,
     )
     findings = path_findings(map(Path, paths), at)
-    chosen = FindingFilter(severity=levels[severity], strict=strict, vendors=at.vendors)
+    lowest = None if severity == "warning" else levels[severity]
+    chosen = FindingFilter(severity=lowest, strict=strict, vendors=at.vendors)
     return chosen.choose(findings).shown
 
 

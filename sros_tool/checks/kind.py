@@ -261,8 +261,7 @@ class FindingFilter:
     With ``vendors``, findings that are only about other vendors are left out. With a single vendor,
     findings about differences between vendors are left out, too.  ``include`` and ``exclude`` hold
     ids, ids of groups, or patterns with ``*`` and ``?``; an empty ``include`` means all.
-    ``severity`` is the lowest severity that is shown.  A prominent note is shown where warnings
-    are.
+    ``severity`` is the lowest severity that is shown; None shows warnings and prominent notes.
 
     A weakness that the keystore's template chose, such as the single CA of template sros2, is
     accepted: it counts as a note, and is summarized in one line if notes are not shown.  With
@@ -272,7 +271,7 @@ class FindingFilter:
 
     include: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
-    severity: Severity = WARNING
+    severity: Severity | None = None
     strict: bool = False
     vendors: tuple[str, ...] = ()
 
@@ -295,7 +294,9 @@ class FindingFilter:
         return included and not any(_matches(kind, pattern) for pattern in self.exclude)
 
     def _shows(self, finding: Finding) -> bool:
-        return _prominence(finding) >= self.severity
+        if self.severity is None:
+            return _prominence(finding) >= WARNING
+        return finding.severity >= self.severity
 
     def choose(self, findings: Iterable[Finding]) -> ChosenFindings:
         """Return the findings to show, worst first, and the accepted findings that are hidden."""

@@ -105,9 +105,8 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
 @click.option(
     "--severity",
     type=_LEVELS,
-    default="warning",
-    show_default=True,
-    help="Show only findings of this severity or higher.",
+    help="Show only findings of this severity or higher; default: errors, warnings, and the most "
+    "important notes.",
 )
 @click.option(
     "--fail-on",
@@ -229,7 +228,7 @@ def check(
     as_list: bool,
     include: tuple[str, ...],
     exclude: tuple[str, ...],
-    severity: str,
+    severity: str | None,
     fail_on: str,
     strict: bool,
     policies: tuple[Path, ...],
@@ -294,9 +293,10 @@ def check(
         if form == "sarif":
             raise UsageError("--needs-renewal has no SARIF output", "", "Use --json.")
         return _show_renewals(root, needs_renewal, at.now, form)
-    lowest = Severity[severity.upper()]
+    lowest = Severity[severity.upper()] if severity else None
     if _is_option_given("fail_on") and fail_on != "never":  # a hidden finding fails no check
-        lowest = min(lowest, Severity[fail_on.upper()])
+        failing = Severity[fail_on.upper()]
+        lowest = failing if failing < (lowest or Severity.WARNING) else lowest
     check_one_decider()
     vendors = _vendors(vendor, distro, all_distros=all_distros)
     selection = FindingFilter(include, exclude, lowest, strict, vendors)

@@ -103,7 +103,7 @@ def test_without_security_each_open_node_is_named(sound_one: RuntimeState, bench
         "ROS_SECURITY_ENABLE is not set; open nodes: process 100 (talker) in domain 3, "
     )
     assert found.text.endswith("process 119 (talker) in domain 3 and 10 more")
-    for severity, shown in ((NOTE, True), (WARNING, True), (ERROR, False)):
+    for severity, shown in ((None, True), (NOTE, True), (WARNING, False), (ERROR, False)):
         chosen = FindingFilter(severity=severity).choose([found])
         assert bool(chosen.shown) is shown
         assert not chosen.fails(WARNING)

@@ -131,6 +131,18 @@ def test_what_holds_and_what_cannot_fail(folder: Path, tmp_path: Path) -> None:
     assert (
         "there is no enclave /teleop; required: only /mux, /web, /teleop may publish" in ended.out
     )
+    note = "requirement.unknown-enclave"
+    only_note = ("check", "robot.xml", "--include", note, "--requirements", held)
+    for options, shown in (
+        ("--fail-on warning", True),
+        ("--severity note", True),
+        ("--severity warning", False),
+        ("--severity error", False),
+        ("--severity error --fail-on warning", False),
+    ):
+        for form, text in (("text", f"[{note}]"), ("json", f'"{note}"'), ("sarif", '"ruleId"')):
+            ended = sros(*only_note, *options.split(), "--format", form, cwd=folder).ok()
+            assert (text in ended.out) is shown, (options, form)
 
 
 def test_an_action_that_is_a_service(tmp_path: Path) -> None:
