@@ -543,27 +543,40 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     robot, observed = running.robot, state.observed
     close = robot.close_command
     silent = "Otherwise, nobody would hear {} any more (--accept nodes accepts this)"
-    if observed.unknown:
-        them, runs = ("it", "it runs") if len(observed.unknown) == 1 else ("them", "they run")
-        processes = first_few(observed.unknown, MOST_NAMES)
+    policy = robot.read_policy()
+    idle = {
+        enclave.path: {profile.full_name for profile in enclave.all_profiles()}
+        for enclave in (policy.enclaves if policy and state.secured else ())
+        if enclave.path in state.stopped
+    }
+    named = running.named_processes(observed, idle)
+    named = {text: named[text] for text in named if not named[text].unit}
+    for text, process in named.items():
+        yield (
+            f"{text.partition(': ')[0]} runs open, and has the name of {process.enclave}: stop it, and, if it is this "
+            f"node, start it in its enclave: {process.secured_command(robot.folder.absolute())}. "
+            f"{silent.format('it')}"
+        )
+    if unknown := [text for text in observed.unknown if text not in named]:
+        them, runs = ("it", "it runs") if len(unknown) == 1 else ("them", "they run")
         advice = f"Watch again while {runs}: {close} --for 1m"
         if observed.elsewhere:
             advice += ". If sros still sees no node, add the node's name to the command of "
             advice += f"each process ({_REMAP})"
         if state.secured:
-            advice = _start_of_unknown_process(running, state)
+            left = {*state.stopped} - {process.enclave for process in named.values()}
+            advice = _start_of_unknown_process(running, unknown, sorted(left), observed)
             advice += (
                 "Stop processes that are not of the robot, such as your own `sros demo listener`"
             )
             # An enclave that was added while the robot is closed may already be of this process.
-            if len(observed.unknown) > len({*state.new}.difference(observed.ended)):
+            if len(unknown) > len(left.intersection(state.new).difference(observed.ended)):
                 learn = how_to_learn_one_process(robot.folder, robot.domain)
                 advice += f". To give another process its own enclave, {learn}"
-        unknown = "the enclave of" if state.secured else "a node of"
-        number = counted(len(observed.unknown), "open process", "open processes")
-        yield (
-            f"sros does not know {unknown} {number}: {processes}. {advice}. {silent.format(them)}"
-        )
+        what = "the enclave of" if state.secured else "a node of"
+        number = counted(len(unknown), "open process", "open processes")
+        processes = first_few(unknown, MOST_NAMES)
+        yield f"sros does not know {what} {number}: {processes}. {advice}. {silent.format(them)}"
     routers = [process for process in running.open_processes if process.is_router]
     if routers and not any(process.is_router for process in observed.processes):
         yield (
@@ -592,28 +605,30 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         )
 
 
-def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
-    """Return sentences on how to start an unknown process in an enclave that has no process.
+def _start_of_unknown_process(
+    running: RunningRobot, texts: Sequence[str], idle: Sequence[str], observed: ObservedProcesses
+) -> str:
+    """Return sentences on how to start unknown processes in enclaves ``idle`` without a process.
 
-    Returns "" without such an enclave. The sentence has the command of the process if there is only
-    one process and one enclave, no unit starts the process, and the process is of a user who can
-    read the enclaves.  If units start unknown processes, another sentence says how to name the
-    nodes in the units.
+    Returns "" without such an enclave. ``texts`` are the texts of the processes. The sentence has
+    the command of the process if there is only one process and one enclave, no unit starts the
+    process, and the process is of a user who can read the enclaves.  If units start unknown
+    processes, another sentence says how to name the nodes in the units.
     """
-    observed, export = state.observed, running.robot.export.absolute()
-    if not (idle := sorted(state.stopped)):
+    if not idle:
         return ""
+    export = running.robot.export.absolute()
     start = observed.command_of_new_process(export, "ENCLAVE")
     unknown = [
         secured_process(process, idle[0])
         for process in filter(running.may_use_files, running.open_processes)
-        if process_text(process) in observed.unknown
+        if process_text(process) in texts
     ]
     units = sorted({process.unit for process in unknown} - {""})
-    if len(observed.unknown) == len(idle) == len(unknown) == 1 and not units:
+    if len(texts) == len(idle) == len(unknown) == 1 and not units:
         start = unknown[0].secured_command(export.parent)
     names = first_few(idle, MOST_NAMES)
-    which = "the process" if len(observed.unknown) == 1 else "one of them"
+    which = "the process" if len(texts) == 1 else "one of them"
     advice = f"If {which} belongs in {names}, stop it, and start it in its enclave: {start}. "
     if units:
         advice += (

@@ -399,21 +399,13 @@ class RunningRobot:
     ) -> ObservedProcesses:
         """Return the observed processes, and the open processes of units for enclaves without one.
 
-        ``idle`` maps these enclaves to the full names of their nodes. Only processes of users who
-        can read the enclaves count, and only units that start a single process. Only a name shows
-        the enclave: the last process left may be any program, and may not get rights.
+        ``idle`` maps these enclaves to the full names of their nodes. Only units that start a
+        single process count.
         """
-        programs = _programs_of_enclaves(observed)
-        claims: dict[str, list[tuple[Process, str]]] = {}
-        for process in filter(self.may_use_files, self.open_processes):
-            enclaves, known_by = _enclaves_of(process, idle, programs)
-            if len(enclaves) == 1 and process_text(process) in observed.unknown:
-                claims.setdefault(enclaves[0], []).append((process, known_by))
         recognized = {
-            process_text(process): known._replace(known_by=known_by)
-            for enclave, ((process, known_by), *others) in claims.items()
-            if not others
-            and (known := with_command_of_unit(secured_process(process, enclave))).unit
+            text: known
+            for text, named in self.named_processes(observed, idle).items()
+            if (known := with_command_of_unit(named)).unit
             and self._programs_of_units[known.unit] == 1
         }
         moved = {known.enclave for known in recognized.values()}
@@ -422,6 +414,27 @@ class RunningRobot:
             processes=[*stay, *recognized.values()],
             unknown=[text for text in observed.unknown if text not in recognized],
         )
+
+    def named_processes(
+        self, observed: ObservedProcesses, idle: Mapping[str, Collection[str]]
+    ) -> Mapping[str, ClosedProcess]:
+        """Map unknown open processes (their text) to the enclaves' processes that they seem to be.
+
+        ``idle`` maps enclaves without a process to the full names of their nodes. Only processes of
+        users who can read the enclaves count. Only a name shows the enclave: the last process left
+        may be any program, and may not get rights.
+        """
+        programs = _programs_of_enclaves(observed)
+        claims: dict[str, list[tuple[Process, str]]] = {}
+        for process in filter(self.may_use_files, self.open_processes):
+            enclaves, known_by = _enclaves_of(process, idle, programs)
+            if len(enclaves) == 1 and process_text(process) in observed.unknown:
+                claims.setdefault(enclaves[0], []).append((process, known_by))
+        return {
+            process_text(process): secured_process(process, enclave)._replace(known_by=known_by)
+            for enclave, ((process, known_by), *others) in claims.items()
+            if not others
+        }
 
     def other_domains_text(self) -> str:
         """Return the processes of other ROS domains, with the commands that close them, or ""."""

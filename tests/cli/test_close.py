@@ -900,15 +900,18 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     )
     export = robot.folder / "robot/export"
     start = f"cd /opt && sros run {export} /late -- /opt/late --ros-args"
-    assert (
-        f". If the process belongs in /late, stop it, and start it in its enclave: {start}. Stop"
-        in said
-    )
-    assert "such as your own `sros demo listener`. Otherwise, nobody would hear" in said
+    named = "process 7 (late) runs open, and has the name of /late: stop it, and, if it is this"
+    assert f"{named} node, start it in its enclave: {start}. Otherwise, nobody would" in said
+    assert "sros does not know the enclave" not in said
     a_unit_that_started_after_the_watch(robot, late)
-    robot.more = (late, replace(late, pid=8, command=("/opt/more", "--ros-args")))
+    other = replace(late, pid=8, command=("/opt/more", "--ros-args"))
+    robot.more = (other,)
+    start = f"cd /opt && sros run {export} /late -- /opt/more --ros-args"
+    belongs = "If the process belongs in /late, stop it, and start it in its enclave"
+    assert f". {belongs}: {start}. Stop processes" in robot.close(status=1).out
+    robot.more = (late, other)
     said = robot.close(status=1).out
-    assert f"in its enclave: sros run {export} ENCLAVE -- COMMAND. Stop processes that " in said
+    assert named in said and "of 1 open process: process 8 (more): /opt/more --ros-args." in said
     assert (
         "`sros demo listener`. To give another process its own enclave, let the process run" in said
     )
