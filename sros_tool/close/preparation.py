@@ -552,10 +552,10 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     named = running.named_processes(observed, idle)
     named = {text: named[text] for text in named if not named[text].unit}
     for text, process in named.items():
+        label, start = text.partition(": ")[0], process.secured_command(robot.folder.absolute())
         yield (
-            f"{text.partition(': ')[0]} runs open, and has the name of {process.enclave}: stop it, and, if it is this "
-            f"node, start it in its enclave: {process.secured_command(robot.folder.absolute())}. "
-            f"{silent.format('it')}"
+            f"{label} runs open, and has the name of {process.enclave}: stop it, and, if it is "
+            f"this node, start it in its enclave: {start}. {silent.format('it')}"
         )
     if unknown := [text for text in observed.unknown if text not in named]:
         them, runs = ("it", "it runs") if len(unknown) == 1 else ("them", "they run")
