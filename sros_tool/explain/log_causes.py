@@ -975,12 +975,15 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
         )
     renamed = ""
     if len(meant) == 1:
+        other_name = ""
+        if name != (new_name := _last_part(wrong)):
+            rule = quote(f"__node:={new_name}")
+            other_name = f"; if the node is NAME in OTHER, write `--node NAME --remap {rule}`"
         renamed = (
             f". If the new name is wanted, write {wrong} in the profile of {meant[0]}. If the "
-            "profile was merged from the policy of a package, merge that policy again instead, "
-            "into a policy without the node: `sros merge_policy POLICY OTHER "
-            f"{_merge_options(meant[0], wrong)}` (before `:__node`, write the name that OTHER has "
-            "for the node)"
+            "profile was merged from the policy of a package, merge that policy again instead: "
+            f"`sros merge_policy POLICY OTHER {_merge_options([wrong], enclave)}` (into a policy "
+            f"without {meant[0]}, if this node no longer runs){other_name}"
         )
     return (
         f"{start}{renamed}. A further node needs a profile with common/node.xml: in the policy of "
@@ -992,25 +995,25 @@ def _composing_advice(nodes: Sequence[str]) -> str:
     """Return the remedy for one process that runs ``nodes`` although they have several enclaves."""
     spaces = {node.rpartition("/")[0] for node in nodes}
     if len(spaces) == 1:
-        ns, each = spaces.pop(), ""
-        options = [f"--namespace {quote(ns)}"] * bool(ns) + [f"--enclave {quote(f'{ns}/NEW')}"]
-        options += [f"--node {quote(_last_part(node))}" for node in nodes]
+        options, each = _merge_options(nodes, f"{spaces.pop()}/NEW"), ""
     else:
-        options, each = ["--namespace NS", "--enclave /NEW", "--node NODE"], ", once for each node"
+        options, each = "--namespace NS --enclave /NEW --node NODE", ", once for each node"
     return (
         "give these nodes one enclave: write their profiles into one <enclave> of the policy. "
         "Profiles from the policy of a package, merge again into a policy without these nodes: "
-        f"`sros merge_policy POLICY OTHER {' '.join(options)}`{each}. Then start the process in "
+        f"`sros merge_policy POLICY OTHER {options}`{each}. Then start the process in "
         "the new enclave."
     )
 
 
-def _merge_options(node: str, renamed: str) -> str:
-    """Return the options with which `sros merge_policy` gives a node another full name."""
-    (ns, _, name), (new_ns, _, new_name) = node.rpartition("/"), renamed.rpartition("/")
-    rules = [f"{name}:__node:={new_name}"] * (name != new_name)
-    rules += [f"{new_name}:__ns:={new_ns or '/'}"] * (ns != new_ns)
-    return " ".join(f"--remap {quote(rule)}" for rule in rules)
+def _merge_options(nodes: Sequence[str], enclave: str) -> str:
+    """Return the options with which `sros merge_policy` puts nodes of a package into an enclave.
+
+    The ``nodes`` are full names in one namespace.
+    """
+    ns = nodes[0].rpartition("/")[0]
+    options = [f"--namespace {quote(ns)}"] * bool(ns) + [f"--enclave {quote(enclave)}"]
+    return " ".join([*options, *(f"--node {quote(_last_part(node))}" for node in nodes)])
 
 
 def _enclaves_text(enclaves: Sequence[str]) -> str:

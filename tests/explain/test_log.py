@@ -25,7 +25,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import PARAMETER_SERVICES
 from sros_tool.pki.certificates import identity_of, load_certificate
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.remapping import remapped_policies
+from sros_tool.policy.model import Policy
 from sros_tool.runtime.log_texts import LOG_TEXTS, UNKNOWN, LogText
 from sros_tool.runtime.zenoh_log import ZENOH_TEXTS
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
@@ -818,6 +818,22 @@ def test_the_log_file_names_the_domain(keystore: Path, tmp_path: Path) -> None:
     assert "the process was in domain 42" in found
 
 
+def merged_as_advised(found: str, name: str, folder: Path) -> Policy:
+    """Return a package's policy with the node ``name``, merged by the command in ``found``."""
+    enclaves = {"/e": publish("chatter"), "/other": publish("x")}
+    other = policy_text(enclaves).replace('node="n"', f'node="{name}"', 1)
+    (folder / "other.xml").write_text(other)
+    (folder / "empty.xml").write_text('<policy version="0.2.0"><enclaves/></policy>')
+    (options,) = re.findall("`sros merge_policy POLICY OTHER ([^`]*)`", found)
+    renaming = re.search("; if the node is NAME in OTHER, write `([^`]*)`", found)
+    if f"--node {name}" not in options:
+        assert renaming
+        options = re.sub("--node [^ ]+", renaming[1].replace("NAME", name), options)
+    sros("merge_policy", "empty.xml", "other.xml", *options.split(), "-o", "m.xml", "--force",
+         cwd=folder).ok()  # fmt: skip
+    return read_policy(folder / "m.xml")
+
+
 @pytest.mark.parametrize(
     ("log", "node"),
     [
@@ -826,16 +842,16 @@ def test_the_log_file_names_the_domain(keystore: Path, tmp_path: Path) -> None:
         ("namespace_differs", "/hall/talker"),
     ],
 )
-def test_a_node_of_another_name_is_told(keystore: Path, log: str, node: str) -> None:
+def test_a_node_of_another_name_is_told(
+    keystore: Path, log: str, node: str, tmp_path: Path
+) -> None:
     path = LOGS / f"{FAST_14}.{log}.log"
     found = sros("explain", keystore, ENCLAVE, "--log", path).out
     assert f"the permissions are for the node /talker, and this is the node {node}" in found
     assert "`--ros-args -r __node:=talker -r __ns:=/`" in found
     assert f"in the policy of {ENCLAVE}, or in an enclave of its own" in found
-    rules = re.findall("--remap ([^ `]+)", found)
-    text = policy_text({ENCLAVE: publish("chatter")}).replace('node="n"', 'node="talker"')
-    (renamed,), _ = remapped_policies([read_policy(Path("p.xml"), text.encode())], rules)
-    assert renamed.nodes() == {ENCLAVE: (node,)}
+    for name in ("foo", "talker") if node == "/foo" else ("talker",):
+        assert merged_as_advised(found, name, tmp_path).nodes() == {ENCLAVE: (node,)}
     assert f"here it belongs to node {node}" in sros("explain", "--log", path).out
 
 
@@ -855,7 +871,8 @@ def test_one_of_several_nodes_is_renamed_alone(keystore: Path, tmp_path: Path) -
         found
     )
     assert "`--ros-args -r foo:__node:=food -r food:__ns:=/camera`" in found
-    assert "--remap food:__node:=foo --remap foo:__ns:=/`" in found
+    for name in ("foo", "food"):
+        assert merged_as_advised(found, name, tmp_path).nodes() == {ENCLAVE: ("/foo",)}
     assert "-r __node:=food" not in found and "-r __node:=talker" not in found
 
 
