@@ -172,6 +172,8 @@ def overlay(
         for right in normal[0] | normal[1]
     }
     unseen: frozenset[str] = frozenset()
+    # Nodes without a known enclave may be those of an enclave that seems unobserved.
+    is_unclear = any(finding.id == "graph.unknown-enclave" for finding in second_source.findings)
     if kind == "use":
         unseen = frozenset(right.enclave for right in rights[0] - rights[1])
         unseen -= {right.enclave for right in rights[1]}
@@ -182,7 +184,12 @@ def overlay(
         picture,
         overlay=_OVERLAYS[kind],
         differences=_unused_rights(edges) if kind == "use" else _overlay_differences(*rights),
-        enclaves=tuple(replace(e, observed=e.path not in unseen) for e in picture.enclaves),
+        enclaves=tuple(
+            replace(e, observed=is_unclear, note=e.note or "perhaps observed" * is_unclear)
+            if e.path in unseen
+            else e
+            for e in picture.enclaves
+        ),
     )
 
 

@@ -254,7 +254,9 @@ class PicturedEnclave:
     problems: tuple[str, ...] = ()
     """Faults that keep a process from using the enclave."""
     observed: bool = True
-    """With ``--observed``: whether the enclave was observed."""
+    """With ``--observed``: whether the enclave was observed, or may have been: the observation has
+    nodes whose enclaves it does not show.
+    """
     domains: str = ""
     """ROS domains of the enclave's rights, such as ``10`` or ``10,20``; empty for every domain."""
     note: str = ""

@@ -16,7 +16,7 @@ from sros_tool.proof.sources import AT
 from sros_tool.report.compose import compose, group_of, overlay, protection_of
 from sros_tool.report.folding import Folding
 from sros_tool.report.formats import render
-from sros_tool.report.picture import Lack, OverlaySide
+from sros_tool.report.picture import Lack, OverlaySide, PicturedFinding
 from sros_tool.report.picture import WireLevel as Shown
 from sros_tool.translate import governance_for
 from tests.report.pictures import edge, group, mobile_robot, source_of
@@ -84,6 +84,12 @@ def test_over_privilege_stands_out_and_agrees_with_minimize_policy(tmp_path: Pat
         ("/idle", "/other"): OverlaySide.BOTH,  # nothing is known of it
     }
     assert {e.path: e.observed for e in picture.enclaves} == {"/talker": True, "/idle": False}
+    lost = PicturedFinding("graph.unknown-enclave", "note", "nodes without a known enclave")
+    unclear = overlay(first, replace(second, findings=(lost,)), "use")
+    assert {e.path: (e.observed, e.note) for e in unclear.enclaves} == {
+        "/talker": (True, ""),
+        "/idle": (True, "perhaps observed"),
+    }
     use = minimize(read_policy(tmp_path / "policy.xml"), second.rights).uses[0]
     talker = [e for e in picture.edges if e.enclave == "/talker" and e.name != "/secret"]
     assert use.allowed == sum(e.mark is not OverlaySide.SECOND for e in talker)
