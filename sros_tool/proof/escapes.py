@@ -16,7 +16,7 @@ from sros_tool.errors import DocumentError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave
-from sros_tool.policy.patterns import Names, common_name, overlap
+from sros_tool.policy.patterns import Names, common_name, covers, overlap
 from sros_tool.policy.rights import (
     NodeName,
     Right,
@@ -224,26 +224,38 @@ def access_by_name_findings(
     gained = {right for right in old ^ new if _is_gained(right, new)}
     # As they were before: the change may also name its own enclaves in them.
     whole = {
-        _about_rights(replace(requirement, unmoved=()), gained): requirement
+        of_name: requirement
         for requirement in earlier
         if isinstance(requirement, Only)
         and patterns_of_any_package(requirement)
         and similar_requirements(requirement)
+        for of_name in _of_single_names(_about_rights(replace(requirement, unmoved=()), gained))
     }
-    narrowed = [requirement for requirement in whole if requirement.rights]
-    for requirement, steps in decide_all(narrowed, system).by_name:
+    reported: set[tuple[Requirement, str]] = set()
+    for requirement, steps in decide_all([*whole], system).by_name:
         wanted = split_actions(
             Right("", ALLOW, right, name) for right, names in requirement.rights for name in names
         )
         for step in steps:
-            if any(
+            new = any(
                 own.enclave == step.use.enclave
                 and own.right == right.right
                 and overlap(own.name, right.name)
+                and not _is_allowed(step.use.enclave, own, right.name, old)
                 for own in gained
                 for right in wanted
-            ):
-                text = f"{step.text()}: new access, which the requirement allows only by "
+            )
+            if new and (whole[requirement], step.use.enclave) not in reported:
+                reported.add((whole[requirement], step.use.enclave))
+                text = step.text()
+                example = Right("", ALLOW, step.use.right, step.use.name)
+                if all(
+                    _is_allowed(step.use.enclave, of, of.name, old)
+                    for of in split_actions([example])
+                ):
+                    ((word, (name,)),) = requirement.rights
+                    text = f"{step.use.enclave} may {word} more names that match {name}"
+                text += ": new access, which the requirement allows only by "
                 patterns = first_few(patterns_of_any_package(requirement), 3)
                 text += f"{patterns}, as to any enclave of such a name"
                 place = step.source or similar_requirements(whole[requirement])[0].source
@@ -251,6 +263,27 @@ def access_by_name_findings(
                 remedy += "already listed the enclave in the requirement by its own name."
                 subject = str(whole[requirement])
                 yield DROPPED.found(subject, text, place.file, place.line, remedy)
+
+
+def _of_single_names(requirement: Only) -> Iterator[Only]:
+    """Yield the requirement for each of its names alone."""
+    for right, names in requirement.rights:
+        yield from (replace(requirement, rights=((right, (name,)),)) for name in names)
+
+
+def _is_allowed(enclave: str, gained: Right, name: str, old: Collection[Right]) -> bool:
+    """Return whether ``old`` rights of an enclave give what a gained right gives of ``name``.
+
+    False can be wrong if only several of the old rights together give it.
+    """
+    known = [of for of in old if (of.enclave, of.right) == (enclave, gained.right)]
+    return any(
+        of.qualifier is ALLOW and (covers(of.name, name) or covers(of.name, gained.name))
+        for of in known
+    ) and not any(
+        of.qualifier is not ALLOW and overlap(of.name, name) and overlap(of.name, gained.name)
+        for of in known
+    )
 
 
 def _about_rights(requirement: Only, rights: Iterable[Right]) -> Only:

@@ -18,6 +18,7 @@ from sros_tool.checks.kind import Finding, FindingKind
 from sros_tool.checks.requirements import ALLOWED_BY_NAME, HOLDS_ALONE, VACUOUS, VIOLATED
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet
+from sros_tool.names import is_expression
 from sros_tool.policy.model import Policy, policy_in_namespace
 from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import Right, placed_rights
@@ -37,6 +38,7 @@ from sros_tool.proof.requirements import (
     Requirement,
     dropped_findings,
     dropped_requirements,
+    names_of,
     read_all_requirements,
     renamed_names,
 )
@@ -331,7 +333,10 @@ def _failures(decided: Decisions, findings: Sequence[Finding]) -> dict[_Failure,
     }
     broken = (finding for finding in findings if finding.kind is VIOLATED)
     for violation, finding in zip(decided.violations, broken, strict=True):
-        steps = ((step.use, step.stated_form()[3]) for step in violation.steps)
+        # Of a single name, a wildcard gives no more than the name does.
+        names = [*names_of(violation.requirement)]
+        is_single = len(names) == 1 and not is_expression(names[0])
+        steps = ((step.use, "" if is_single else step.stated_form()[3]) for step in violation.steps)
         uses = tuple((use.enclave, use.right, use.name, by) for use, by in steps)
         others = {use.enclave for uses in violation.witness.others for use in uses}
         why = violation.worlds, violation.missing, violation.idle
