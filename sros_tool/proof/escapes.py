@@ -237,7 +237,7 @@ def access_by_name_findings(
             Right("", ALLOW, right, name) for right, names in requirement.rights for name in names
         )
         for step in steps:
-            new = any(
+            is_new = any(
                 own.enclave == step.use.enclave
                 and own.right == right.right
                 and overlap(own.name, right.name)
@@ -245,7 +245,7 @@ def access_by_name_findings(
                 for own in gained
                 for right in wanted
             )
-            if new and (whole[requirement], step.use.enclave) not in reported:
+            if is_new and (whole[requirement], step.use.enclave) not in reported:
                 reported.add((whole[requirement], step.use.enclave))
                 text = step.text()
                 example = Right("", ALLOW, step.use.right, step.use.name)

@@ -1119,7 +1119,10 @@ class _Review:
             required.head.files.values(), system, asked.namespaces, asked.remaps
         )
         # In several namespaces, a requirement with absolute names is decided several times.
-        return _chosen(dict.fromkeys(findings))
+        status, chosen = _chosen(dict.fromkeys(findings))
+        if status == _OK:
+            required.check_tried()
+        return status, chosen
 
     def _dropped_step(self, required: ReviewedRequirements) -> tuple[int, Content] | None:
         """Return status and findings on requirements that HEAD drops or weakens, or None."""

@@ -6,7 +6,7 @@ They are decided for one subject at a time: the reviewed policies, or a keystore
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
@@ -16,10 +16,11 @@ from typing import NamedTuple
 
 from sros_tool.checks.kind import Finding, FindingKind
 from sros_tool.checks.requirements import ALLOWED_BY_NAME, HOLDS_ALONE, VACUOUS, VIOLATED
-from sros_tool.errors import SrosError
+from sros_tool.errors import DocumentError, SrosError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.names import is_expression
 from sros_tool.policy.model import Policy, policy_in_namespace
+from sros_tool.policy.patterns import Names
 from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import Right, placed_rights
 from sros_tool.proof.escapes import (
@@ -34,6 +35,7 @@ from sros_tool.proof.escapes import (
 )
 from sros_tool.proof.findings import Decisions, decide_all, decided_findings, requirement_findings
 from sros_tool.proof.requirements import (
+    Apart,
     DroppedRequirement,
     Requirement,
     dropped_findings,
@@ -44,6 +46,7 @@ from sros_tool.proof.requirements import (
 )
 from sros_tool.proof.sources import AccessSource
 from sros_tool.proof.system import System
+from sros_tool.wording import first_few
 
 ONLY_THE_CHANGE = "whether the change breaks them"
 _LASTING_NOTES = (HOLDS_ALONE, ALLOWED_BY_NAME)
@@ -176,16 +179,40 @@ class ReviewedRequirements:
         """
         return None if self.namespaces or self.has_fleet else self.subject.policies()
 
+    @cached_property
+    def _namespaces(self) -> _Namespaces:
+        package = self._package()
+        if not package:
+            return _Namespaces([], 0)
+        return _namespaces_to_try(*package, self.head.requirements)
+
     def decided_elsewhere(self) -> str:
         """Return a clause on what is decided in other namespaces; "" for nothing."""
-        package = self._package()
-        known = len(_namespaces_to_try(*package)) if package else 0
+        known = len(self._namespaces.ordered)
         if known <= MOST_NAMESPACES:
             return ONLY_THE_CHANGE if known else ""
         return (
-            f"{ONLY_THE_CHANGE} in {MOST_NAMESPACES} of {known} namespaces (those of changed names "
-            "first)"
+            f"{ONLY_THE_CHANGE} in {MOST_NAMESPACES} of {known} namespaces (first those in which a "
+            "changed name can match a requirement)"
         )
+
+    def check_tried(self) -> None:
+        """Raise an error if the change may break a requirement in a namespace that is not tried.
+
+        Raises:
+            DocumentError: a changed name can match a requirement there.
+        """
+        if not self.is_relative:
+            return
+        untried = self._namespaces.ordered[MOST_NAMESPACES : self._namespaces.count_matching]
+        if untried:
+            raise DocumentError(
+                f"requirements were not decided in {first_few(untried, 3)}: the review tries only "
+                f"{MOST_NAMESPACES} namespaces",
+                "A name of an added or removed right can match a name of a requirement there.",
+                "Change the names of fewer namespaces in one commit, or name the namespaces of the "
+                "robots with --namespace.",
+            )
 
     def findings_elsewhere(self) -> Iterator[Finding]:
         """Yield findings on requirements that fail in another namespace only because of the change.
@@ -196,7 +223,7 @@ class ReviewedRequirements:
         package = self._package() if self.is_relative else None
         if not package:
             return
-        tried = _namespaces_to_try(*package)[:MOST_NAMESPACES]
+        tried = self._namespaces.ordered[:MOST_NAMESPACES]
         failing = {violation.requirement for violation in self.decided.violations}
         failing |= {requirement for requirement, _ in self.decided.vacuous}
         # In the namespaces of its own patterns, a requirement is for other enclaves than in /.
@@ -267,22 +294,50 @@ class ReviewedRequirements:
         return moves.follow(self.base.requirements, moved, required, system)
 
 
-def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
+class _Namespaces(NamedTuple):
+    """Namespaces in which requirements that hold in ``/`` may be broken.
+
+    In the first ``count_matching``, a changed name can match a name of a requirement.
+    """
+
+    ordered: Sequence[str]
+    count_matching: int
+
+
+def _namespaces_to_try(
+    before: AccessSource, after: AccessSource, requirements: Iterable[Requirement]
+) -> _Namespaces:
     """Return namespaces in which requirements that hold in ``/`` may be broken.
 
     The first namespace is in no right, and stands for all other such namespaces. It is followed by
     the namespaces in names that do not move with the namespace, and by namespaces that wildcards in
-    these names match; namespaces of added and removed rights come first.
+    these names match.  Namespaces in which such a name of an added or removed right can match a
+    requirement come first, then other namespaces of added and removed rights.
     """
     enclaves = (*before.enclaves.values(), *after.enclaves.values())
-    placed = chain.from_iterable(map(placed_rights, enclaves))
-    fixed = {of.right.name for of in placed if of.written.startswith(("/", "*"))}
-    changed = {right.name for right in before.rights ^ after.rights}
-    names = sorted(fixed, key=lambda name: (name not in changed, name))
+    fixed: set[str] = set()
+    moving: set[str] = set()
+    for placed in chain.from_iterable(map(placed_rights, enclaves)):
+        names = fixed if placed.written.startswith(("/", "*")) else moving
+        names.add(placed.right.name)
+    changed = fixed.intersection(right.name for right in before.rights ^ after.rights)
     ordinary = "/any_namespace"
     while any(ordinary in right.name for right in (*before.rights, *after.rights)):
         ordinary += "_"
-    return [*dict.fromkeys([ordinary, *namespaces_in(names)])]
+    relative = [requirement for requirement in requirements if requirement.is_relative]
+    required = {name for requirement in relative for name in names_of(requirement)}
+    if any(isinstance(requirement, Apart) for requirement in relative):
+        required |= moving  # by any name, enclaves may influence each other
+    by_changed_name = Names(sorted(changed))
+    ordered = [*dict.fromkeys(namespaces_in([*sorted(changed), *sorted(fixed)]))]
+    matching = [
+        namespace
+        for namespace in ordered
+        if any(
+            by_changed_name.overlaps(namespace + name) for name in required if name.startswith("/")
+        )
+    ]
+    return _Namespaces([*dict.fromkeys([ordinary, *matching, *ordered])], 1 + len(matching))
 
 
 class _Failure(NamedTuple):

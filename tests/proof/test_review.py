@@ -1827,7 +1827,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     assert "in namespaces other than / (add --namespace /l): sros only decided" in ended.out
     with monkeypatch.context() as patched:
         patched.setattr(reviewed_requirements, "MOST_NAMESPACES", 1)
-        some = "the change breaks them in 1 of 2 namespaces (those of changed names first)"
+        some = "the change breaks them in 1 of 2 namespaces (first those in which a changed name"
         assert some in change.review(*asked).ok().out
     assert (
         "(add --namespace /l); nothing"
@@ -1972,6 +1972,39 @@ def test_a_wildcard_that_leaves_out_one_namespace_breaks_requirements_in_others(
     assert ended.status == 1, ended
     place = f"in namespace {namespace}, which the review tries"
     assert f"error: {namespace}/b: {place}: may publish {namespace}/x" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("names", "status", "said"),
+    [
+        # Namespaces in which no requirement has the name come last.
+        ("/b1/z /b2/z /b3/z /c/x", 1, "error: /c/b: in namespace /c, which"),
+        ("/b1/z /b2/z /b3/z /c/x*", 1, "error: /c/b: in namespace /c, which"),
+        ("/b1/z /b2/z /b3/z", 0, "in 3 of 4 namespaces"),
+        ("/n1/y /n2/y", 0, "[ok] requirements"),
+        ("/n1/y /n2/y /n3/y", 2, "were not decided in /n3: the review tries only 3"),
+        ("/n1/y /n2/y /n3/y /n4/x", 2, "were not decided in /n3, /n4: "),
+        ("/n1/x /n2/y /n3/y", 1, "error: /n1/b: in namespace /n1, which"),
+    ],
+)
+def test_no_name_uses_up_the_namespaces_that_are_tried(
+    change: Change, monkeypatch: pytest.MonkeyPatch, names: str, status: int, said: str
+) -> None:
+    """What is left untried is undecided, if a requirement could be broken there.
+
+    /a, which may publish all names of the requirement, gets the names with y.
+    """
+    only = '[[only]]\npublish = ["x", "y"]\nenclaves = ["/a"]\n'
+    robot = {"/a": publish("x", "y"), "/b": publish("w"), "/c": subscribe("x", "y")}
+    change.base = change.commit({"robot.xml": policy_text(robot), "robot.toml": only})
+    own = [name for name in names.split() if name.endswith("/y")]
+    others = [name for name in names.split() if name not in own]
+    added = {"/a": publish("x", "y", *own), "/b": publish("w", *others)}
+    change.commit({"robot.xml": policy_text(robot | added)})
+    monkeypatch.setattr(reviewed_requirements, "MOST_NAMESPACES", 3)
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    ended = change.review(*asked)
+    assert (ended.status, said in ended.out) == (status, True), ended
 
 
 @pytest.mark.parametrize(
