@@ -19,6 +19,8 @@ from shlex import quote
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
+from sros_tool.fleet.robots import enclaves_of, robot_of
+from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY,
@@ -474,9 +476,11 @@ class KnownKeys:
         The keystore made such a key after it was restored, before a message or a published release
         showed it the certificate for the robot's key, which was made after the backup and is not
         revoked.  ``unrecorded`` are such certificates that the ledger still lacks.  Only enclaves
-        whose present key is in the keystore are in the result.
+        whose present key is in the keystore are in the result.  A message shows the certificate of
+        one enclave, so enclaves that were made together with such an enclave count, too.
         """
-        found: dict[str, str] = {}
+        unrecorded = tuple(unrecorded)
+        found = self._made_for_added_robots(names, unrecorded)
         shown: dict[str, list[Entry]] = defaultdict(list)
         for entry in (*self.certificates_shown_after_restore(names), *unrecorded):
             shown[entry.enclave].append(entry)
@@ -493,6 +497,60 @@ class KnownKeys:
             ):
                 found[own] = name
         return found
+
+    def _made_for_added_robots(
+        self, names: Collection[str], unrecorded: Sequence[Entry]
+    ) -> dict[str, str]:
+        """Map keys of robots that were added after the backup to their enclaves in ``names``.
+
+        The restored keystore made these keys before it was shown that the robot has another key for
+        one of its enclaves.  ``unrecorded`` is as in `made_unknowing`.
+        """
+        if not (unrecorded or self._keystore.entries_of(RESTORED)):
+            return {}
+        fleet = load_fleet(self._keystore)
+        owners = (robot_of(fleet, name) for name in names) if fleet else ()
+        robots = {robot.name: robot for robot in owners if robot}
+        robot_by_enclave = {
+            name: robot.name
+            for robot in robots.values()
+            for name in (enclaves_of(fleet, robot) if fleet else ())
+        }
+        shown = (*self.certificates_shown_after_restore(robot_by_enclave), *unrecorded)
+        added: dict[str, list[Entry]] = defaultdict(list)
+        for entry in shown:
+            robot = robot_by_enclave.get(entry.enclave)
+            if (
+                robot
+                and not self.is_revoked(entry.key)
+                and self._is_made_later(entry.enclave, entry)
+            ):
+                added[robot].append(entry)
+        found: dict[str, str] = {}
+        for name in {*names}.difference(entry.enclave for entry in shown) if added else ():
+            own = self._present_key(name)
+            if (
+                any(
+                    self._is_made_later(name, entry)
+                    for entry in added[robot_by_enclave.get(name, "")]
+                )
+                and has_key(self._keystore.folder(name))
+                and [*self._first_certificates(name)][:1] == [own]
+            ):
+                found[own] = name
+        return found
+
+    def _is_made_later(self, name: str, shown: Entry) -> bool:
+        """Return whether the keystore made an enclave's first key unaware of a ``shown`` one.
+
+        The key is another one, and is newer, but was recorded before the certificate was shown.
+        """
+        first = next(iter(self._first_certificates(name).values()), shown)
+        return (
+            first.key != shown.key
+            and first.not_before > shown.not_before
+            and first.time <= shown.time
+        )
 
     def _first_certificates(self, name: str) -> dict[str, Entry]:
         """Map the keys of an enclave to the entries of their first certificates.

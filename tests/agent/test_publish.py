@@ -52,7 +52,7 @@ from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import CRL, ca_key_path
 from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
-from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.ledger import LATER_RELEASE, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import LostRecords
@@ -1584,73 +1584,90 @@ _ORDERS = [
     "name, new, restored!, sign again, old, restored",
     "lost, generate, collect, restored!, sign again, old, restored",
     "lost, generate, restored, collect, old!, deliver!, sign again, old",
+    "lost, seen, generate!, sign, generate, restored",
+    "lost, seen, name, collect, restored!, sign again, old, restored",
 ]
-"""Commands of an operator after a restore; ``!`` stands for a refusal."""
+"""Commands of an operator after a restore; ``!`` stands for a refusal.
+
+After "seen", only the seal of another robot has shown that the keystore was restored.
+"""
 
 
 @pytest.mark.parametrize("order", _ORDERS)
 def test_a_restored_keystore_replaces_no_key_that_a_robot_made(
     publisher: Home, order: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The robot came after the backup; only its release and its request have its key."""
+    """The robot came after the backup; only its release and its requests have its keys.
+
+    A message shows only the certificate of one enclave.
+    """
     monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
-    root, fleet, name = publisher.root, publisher.folder / "fleet.toml", "/r9/base"
+    root, fleet, names = publisher.root, publisher.folder / "fleet.toml", ["/r9/arm", "/r9/base"]
     policy = ("-p", "policy.xml", "--fleet", "fleet.toml")
+    generate = ("generate_artifacts", "-k", "ks", *policy)
+    rights = {f"/{{robot}}/{each}": allow_publish("x") for each in ("arm", "base")}
+    (publisher.folder / "policy.xml").write_text(policy_text(rights))
+    publisher.run(*generate)
     publisher.publish()  # so that the backup records the folder
     backup = copy_of(root, publisher.folder / "backup")
     fleet.write_text(f"{fleet.read_text()}[robots.r9]\n")
-    request = create_request(publisher.folder / "r9", name).file
-    sign = ("sign_request", "ks", request, "--no-answer")
-    generate = ("generate_artifacts", "-k", "ks", *policy)
+    sent = publisher.folder / "requests"
+    requests = [create_request(publisher.folder / "r9", each).file for each in names]
+    sent.write_bytes(b"".join(request.read_bytes() for request in requests))
+    sign = ("sign_request", "ks", sent, "--no-answer")
     publisher.run(*sign, *policy)
     publisher.run(*generate)
     publisher.publish()
-    later = OpenedKeystore(root).certificate_of(name)
+    later = OpenedKeystore(root).certificate_of(names[1])
     shutil.rmtree(root)
     backup.rename(root)
     lost = order.startswith("lost")
     if lost:
         shutil.rmtree(publisher.pub)
 
-    def collect() -> None:
-        shown = LostRecords(OpenedKeystore(root), publisher.now)
-        shown.add_certificate(later)
-        (note,) = (e.text for e in restore_revocations(root, shown, now=publisher.now).notes)
-        assert mend in note and f"other keys for {name} than the keystore" in note
-
     request_again = f"sign its request again, with `sros sign_request {root} REQUEST --no-answer"
-    mend = f"{request_again} --renew`, and run `sros renew {root} /r9/base --revoke-old`"
+    mend = f"{request_again} --renew`, and run `sros renew {root} /r9/arm /r9/base --revoke-old`"
     commands = {
         "restored": ("fleet", "publish", "ks", "pub", "--restored", *["--new-folder"] * lost),
         "generate": generate,
         "generate old": (*generate, "--revoke-old"),
-        "name": (*generate, "-e", name),
-        "new": ("renew", "ks", name, "--new-key", "--revoke-old"),
+        "name": (*generate, "-e", *names),
+        "new": ("renew", "ks", *names, "--new-key", "--revoke-old"),
         "deliver": ("distribute_key", "ks", "--robot", "r9", "r9", "--force"),
-        "old": ("renew", "ks", name, "--revoke-old"),
+        "old": ("renew", "ks", *names, "--revoke-old"),
         "sign": (*sign, *policy),
         "sign again": (*sign, "--renew"),
     }
-    key, made = key_digest(load_request(request.read_bytes(), "it").public_key), set[str]()
+    keys = [key_digest(load_request(file.read_bytes(), "it").public_key) for file in requests]
+    made = set[str]()
     for step in order.removeprefix("lost, ").split(", "):
         publisher.now += LATER
-        if step == "collect":
-            collect()
+        if step in ("collect", "seen"):
+            shown = LostRecords(OpenedKeystore(root), publisher.now)
+            if step == "collect":
+                shown.add_certificate(later)
+            reason = LATER_RELEASE * (step == "seen")
+            restored = restore_revocations(root, shown, shown_by=reason, now=publisher.now)
+            for note in (note.text for note in restored.notes):
+                assert mend in note and "other keys for /r9/arm, /r9/base than the keystore" in note
+            assert len(restored.notes) == (step == "collect")
             continue
         done = sros(*commands[step.removesuffix("!")], cwd=publisher.folder)
         assert done.status == (2 if step.endswith("!") else 0), (step, done.err)
         if step.endswith("!") and "generate" not in step:
             assert mend.replace(str(root), "ks") in done.err, (step, done.err)
-        if (root / "enclaves/r9/base/key.pem").exists():
-            made.add(key_digest(OpenedKeystore(root).certificate_of(name).public_key()))  # type: ignore[arg-type]
-    assert not (root / "enclaves/r9/base/key.pem").exists()
+        for name in names:
+            if (root / f"enclaves{name}/key.pem").exists():
+                certificate = OpenedKeystore(root).certificate_of(name)
+                made.add(key_digest(certificate.public_key()))  # type: ignore[arg-type]
+    assert not [*root.glob("enclaves/r9/*/key.pem")]
     publisher.publish()
-    certificate = x509.load_pem_x509_certificate(
-        read_release(archives(publisher)["r9"]).files[f"enclaves{name}/cert.pem"]
-    )
-    assert key_digest(certificate.public_key()) == key  # type: ignore[arg-type]
+    files = read_release(archives(publisher)["r9"]).files
+    for name, key in zip(names, keys, strict=True):
+        certificate = x509.load_pem_x509_certificate(files[f"enclaves{name}/cert.pem"])
+        assert key_digest(certificate.public_key()) == key  # type: ignore[arg-type]
     known = KnownKeys(OpenedKeystore(root))
-    assert not known.is_revoked(key) and all(known.is_revoked(each) for each in made)
+    assert not any(map(known.is_revoked, keys)) and all(map(known.is_revoked, made))
 
 
 def test_a_restored_keystore_makes_no_other_key_for_a_router(publisher: Home) -> None:

@@ -490,8 +490,8 @@ class _RequestCertifier:
     def _remove_key_other_than(self, request: SigningRequest) -> bool:
         """Remove the enclave's private key in the keystore unless it is the key of the request.
 
-        This needs ``replace_keys``, or a restored keystore that certified the key of the request
-        after its backup.  Returns whether the keystore had a key file that fits the request, or
+        This needs ``replace_keys``, or a restored keystore whose robot has other keys
+        (`_is_key_of_robot`).  Returns whether the keystore had a key file that fits the request, or
         that is removed now.
         """
         keystore, name = self._change.keystore, request.name
@@ -500,7 +500,7 @@ class _RequestCertifier:
             return False
         key = load_key(keystore.read(path, "private key"), f"'{path}'")
         if key.public_key() != request.public_key:
-            if not (self._replace_keys or _was_certified_after_backup(self._change.known, request)):
+            if not (self._replace_keys or _is_key_of_robot(self._change.known, request)):
                 return False
             self._change.transaction.remove(f"{enclave_folder(name)}/{KEY_FILE}")
             text = (
@@ -567,10 +567,16 @@ def _check_answer_is_new(answer: Path, force: bool) -> None:
         )
 
 
-def _was_certified_after_backup(known: KnownKeys, request: SigningRequest) -> bool:
-    """Return whether a restored keystore certified the key of a request after its last backup."""
-    key = key_digest(request.public_key)
-    return any(entry.key == key for entry in known.certificates_shown_after_restore([request.name]))
+def _is_key_of_robot(known: KnownKeys, request: SigningRequest) -> bool:
+    """Return whether a restored keystore certified the key of a request after its last backup.
+
+    If only a certificate of another enclave shows that the robot has its own keys, any request
+    counts whose enclave has a key that the restored keystore made.
+    """
+    name, key = request.name, key_digest(request.public_key)
+    if shown := known.certificates_shown_after_restore([name]):
+        return any(entry.key == key for entry in shown)
+    return name in known.made_unknowing([name]).values()
 
 
 def _check_requested_name(
@@ -581,7 +587,7 @@ def _check_requested_name(
     if exists and not renew:
         intended = (
             "add --renew"
-            if _is_certified(keystore, request) or _was_certified_after_backup(known, request)
+            if _is_certified(keystore, request) or _is_key_of_robot(known, request)
             else "for example because the robot has new hardware, first "
             + _revocation_advice(keystore, name)
         )

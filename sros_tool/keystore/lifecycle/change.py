@@ -446,14 +446,20 @@ class KeystoreChange:
         The keystore was restored, and publishing or a message showed it the robot's key.
         """
         unknowing = self.known.made_unknowing([certificate.name for certificate in superseded])
-        for name, key in ((each.name, each.new_key) for each in superseded):
-            if not (key in unknowing or self.known.later_key(name, key)):
-                continue
+        others = [
+            name
+            for name, key in ((each.name, each.new_key) for each in superseded)
+            if key in unknowing or self.known.later_key(name, key)
+        ]
+        if others:
+            of_enclaves = f"{first_few(others, 3)} than their robots"
+            if len(others) == 1:
+                of_enclaves = f"enclave {others[0]} than its robot"
             raise KeystoreError(
-                f"the keystore has another key of enclave {name} than its robot",
+                f"the keystore has another key of {of_enclaves}",
                 "After the backup of the keystore, the robot got a certificate for its key. "
                 "--revoke-old would revoke this key.",
-                other_keys_remedy(self.root, [name]),
+                other_keys_remedy(self.root, others),
             )
 
     def stage_zenoh(

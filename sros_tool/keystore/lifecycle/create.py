@@ -28,7 +28,10 @@ from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
 from sros_tool.keystore.delivery.published import may_have_later_releases, read_published
-from sros_tool.keystore.delivery.restored import restores_after_last_release
+from sros_tool.keystore.delivery.restored import (
+    has_unpublished_restore,
+    restores_after_last_release,
+)
 from sros_tool.keystore.expiry import IF_EXPIRED, ONE_BY_ONE
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
@@ -470,7 +473,7 @@ def _revoked_before_notes(
             "command.",
         )
     if unasked := [name for name in missing if name not in named]:
-        _refuse_before_restored(change.keystore, unasked)
+        _refuse_before_restored(change.keystore, unasked, command(unasked))
     return list(known.revoked_before_notes(revoked_before))
 
 
@@ -480,22 +483,37 @@ def _missing_routers(change: KeystoreChange) -> set[str]:
     return {*(network.router_names() if network else ())}.difference(change.names)
 
 
-def _refuse_before_restored(keystore: OpenedKeystore, missing: Sequence[str]) -> None:
-    """Raise `KeystoreError` if later releases exist, which may have the enclaves ``missing``.
+def _refuse_before_restored(keystore: OpenedKeystore, missing: Sequence[str], command: str) -> None:
+    """Raise `KeystoreError` if robots may have made the keys of the enclaves ``missing``.
 
-    Once ``--restored`` has read the releases, the ledger has their certificates.
+    Once ``--restored`` has read the later releases, the ledger has their certificates.  If no
+    folder has later releases any more, nothing shows these certificates.  ``command`` creates the
+    enclaves all the same.
     """
-    if may_have_later_releases(keystore) and PUBLISHING not in restores_after_last_release(
-        keystore
-    ):
-        folder = read_published(keystore).folder
+    restores = restores_after_last_release(keystore)
+    has_later_releases = may_have_later_releases(keystore)
+    if PUBLISHING in restores if has_later_releases else not restores:
+        return
+    policy_clause = (
+        f"The policy would create {first_few(missing, 3)} with new keys, but a robot may have made "
+        "the keys of such an enclave after the backup."
+    )
+    root, folder = quote(str(keystore.root)), read_published(keystore).folder
+    if has_later_releases:
         raise KeystoreError(
             f"'{folder}' has later metadata than the keystore '{keystore.root}' knows",
-            "The keystore was restored from a backup, or is a copy. The policy would create "
-            f"{first_few(missing, 3)} with new keys, but a robot may have made the keys of such an "
-            "enclave after the backup.",
-            f"First run `sros fleet publish {quote(str(keystore.root))} {quote(folder)}`, which "
-            "puts altered metadata right, or says what to do after a restore.",
+            f"The keystore was restored from a backup, or is a copy. {policy_clause}",
+            f"First run `sros fleet publish {root} {quote(folder)}`, which puts altered metadata "
+            "right, or says what to do after a restore.",
+        )
+    # Without publishing, nothing would ever end this refusal.
+    if folder or has_unpublished_restore(keystore):
+        raise KeystoreError(
+            f"the keystore '{keystore.root}' is older than its robots",
+            f"Robots have files that it signed but does not know. {policy_clause}",
+            f"For keys that robots made, sign the requests again, with `sros sign_request {root} "
+            "REQUEST --no-answer -p POLICY_FILE --fleet FLEET_FILE`. For keys that are to be made "
+            f"here, name the enclaves with -e: {command}. Then repeat this command.",
         )
 
 

@@ -435,7 +435,7 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
             "NAME --new-key --revoke-old`. To revoke such an enclave, create it again first, or "
             "replace the CA with `sros rotate_ca`"
         )
-    unknowing = change.known.made_unknowing({*valid}, unknown.values())
+    unknowing = change.known.made_unknowing({*valid, *change.names}, unknown.values())
     if others := sorted({*unknowing.values()}):
         text += (
             f". Robots have other keys for {first_few(others, _MOST_SHOWN)} than the keystore. "
