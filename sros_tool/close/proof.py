@@ -67,6 +67,11 @@ _NOT_PROVED = (
     "restart a node that receives nothing"
 )
 
+_NOT_LOOKED_AT = (
+    "because of this, the proof did not look whether everything can still talk, and what an open "
+    "listener finds"
+)
+
 _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
 
@@ -95,8 +100,8 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     """Wait until each process runs in its enclave, and return the proofs that the robot is closed.
 
     Waits for at most ``patience`` seconds.  If a process is then missing, the only proofs are that
-    it was not started, and, if so, that the files are not accepted.  If the enclave of the observer
-    has expired, only the files are examined.
+    it was not started, and, if so, that the files are not accepted or a requirement is violated.
+    If the enclave of the observer has expired, only the files are examined.
     """
     expired = expired_enclaves(robot, robot.export)
     unsigned_text = cache(partial(_unsigned_policy_text, robot))
@@ -112,8 +117,12 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     if needed or expected == {*missing}:
         observed = state.observed.with_current_pids(running.processes, robot.export)
         why = _why_missing(running, sorted(needed) or missing, observed)
-        files = _proof_of_files(robot, expired, unsigned_text)
-        return [Proof(STARTED, False, why), *([files] if files.fails else [])]
+        others = (
+            _proof_of_files(robot, expired, unsigned_text),
+            _proof_of_requirements(robot, unsigned_text),
+        )
+        started = Proof(STARTED, False, why, details=[_NOT_LOOKED_AT])
+        return [started, *(proof for proof in others if proof.fails)]
     nodes, not_here = ObservedNodes(robot), robot.not_here
     restarts = UnitRestarts(robot, state.observed)
     # A laptop may be away; a computer whose nodes were seen has to be seen again.

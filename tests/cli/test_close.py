@@ -1061,7 +1061,13 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert " another mode, after the start of the processes of /talker: restart them\n" in said
     robot.more = (replace(robot.process("/talker", is_secured=True), pid=13, command=("b",)),)
     named = f"the processes of /talker (processes {PID['/talker']}, 13); {restarts} them\n"
-    assert named in robot.close("--proof", status=1).out
+    required = robot.folder / "robot/requirements.toml"
+    stated = required.read_text()
+    required.write_text('[[nobody]]\npublish = ["/chatter"]\n')
+    said = robot.close("--proof", status=1).out
+    assert named in said and "  because of this, the proof did not look whether everything" in said
+    assert "\nno: the requirements do not all hold: at least one is violated" in said
+    required.write_text(stated)
     robot.outdated, robot.absent = set(), {"/talker"}
     talker = robot.process("/talker", is_secured=True)
     robot.more = (replace(talker, started=datetime.now(UTC) + timedelta(days=1)),)
