@@ -309,7 +309,12 @@ class FindingFilter:
         accepted = [
             finding for finding in hidden if finding.accepted and finding.kind.severity > NOTE
         ]
-        return ChosenFindings(tuple(shown), tuple(accepted), len(hidden) - len(accepted))
+        return ChosenFindings(
+            tuple(shown),
+            tuple(accepted),
+            len(hidden) - len(accepted),
+            hides_warnings=any(finding.severity >= WARNING for finding in hidden),
+        )
 
 
 def _prominence(finding: Finding) -> Severity:
@@ -324,12 +329,14 @@ class ChosenFindings(NamedTuple):
     """The findings to show, and the findings that are left out.
 
     ``accepted`` are left out because the keystore accepts the weakness; ``hidden`` is the number of
-    findings left out because their severity is too low.
+    findings left out because their severity is too low; ``hides_warnings`` says whether some of
+    these are no notes.
     """
 
     shown: tuple[Finding, ...]
     accepted: tuple[Finding, ...]
     hidden: int
+    hides_warnings: bool = False
 
     def numbers(self) -> dict[str, int]:
         """The numbers of shown findings by severity, worst first."""
@@ -340,8 +347,10 @@ class ChosenFindings(NamedTuple):
         """Return a line with the numbers of findings, such as ``2 errors, 1 note``."""
         counts = [counted(number, word) for word, number in self.numbers().items() if number]
         hidden = self.hidden
-        note = "more note" if any(finding.severity is NOTE for finding in self.shown) else "note"
-        unseen = f" (not shown: {counted(hidden, note)}, --severity note)" if hidden else ""
+        word = "finding" if self.hides_warnings else "note"
+        if any(finding.severity is NOTE for finding in self.shown):
+            word = f"more {word}"
+        unseen = f" (not shown: {counted(hidden, word)}, --severity note)" if hidden else ""
         if not self.accepted:
             return f"{', '.join(counts) or 'nothing found'}{unseen}"
         number = counted(len(self.accepted), "weakness", "weaknesses")

@@ -697,7 +697,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
 
     def findings(chosen_findings: ChosenFindings, title: str = "Findings") -> str:
         shown = tuple(map(result.shown_finding, chosen_findings.shown))
-        chosen_findings = ChosenFindings(shown, chosen_findings.accepted, chosen_findings.hidden)
+        chosen_findings = chosen_findings._replace(shown=shown)
         return findings_markdown(chosen_findings, step.fleet, title)
 
     shown_by = "which `sros review` prints"

@@ -181,6 +181,8 @@ def test_thresholds(options: tuple[str, ...], status: int, shown: bool, bench: B
     ended = sros("check", bench.root, *options)
     assert ended.status == status
     assert ("keystore.folder-open" in ended.out) == shown
+    # A warning that is not shown is not called a note.
+    assert ("not shown: 1 finding," in ended.err) is (options == ("--severity", "error"))
 
 
 def without_types(bench: Bench) -> Path:
