@@ -30,7 +30,7 @@ from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import action_part, expand, is_expression, service_of
 from sros_tool.policy.model import ALLOW, DENY, Level, Source
-from sros_tool.policy.patterns import covers, matches
+from sros_tool.policy.patterns import OTHER_NAMESPACE, covers, matches
 from sros_tool.policy.remapping import Remapping, has_new_name, remapped_name
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.decide import (
@@ -57,6 +57,7 @@ from sros_tool.proof.requirements import (
     RightsRequirement,
     Widest,
     demand,
+    enclaves_of,
     names_demanded_by,
     names_of,
     read_all_requirements,
@@ -847,7 +848,8 @@ def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
     """
     if not requirement.is_relative or not isinstance(requirement, RightsRequirement):
         return ""
-    stated = {right.name for right in rights if right.qualifier is ALLOW}
+    allowed = [right for right in rights if right.qualifier is ALLOW]
+    stated = {right.name for right in allowed}
     absent = (name for _, names in requirement.rights for name in names if name not in stated)
     was_moved = requirement.elsewhere is None
     for name in absent:
@@ -858,7 +860,7 @@ def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
                 f"leave out `--namespace {quote(space)}`, or check the policy of a robot into "
                 "which the policy of the package was merged."
             )
-        if not was_moved and (namespaces := sorted(_namespaces_with(name, stated))):
+        if not was_moved and (namespaces := sorted(_namespaces_with(name, requirement, allowed))):
             options = " ".join(f"--namespace {quote(ns)}" for ns in namespaces[:_MOST_SHOWN])
             return (
                 f"The policy names {namespaces[0]}{name}. If these are the requirements of a "
@@ -868,10 +870,19 @@ def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
     return ""
 
 
-def _namespaces_with(name: str, stated: Iterable[str]) -> set[str]:
-    """Return the namespaces, except ``/``, in which names of rights end with ``name``."""
-    moved = {other.removesuffix(name) for other in stated if other.endswith(name)}
-    return {namespace for namespace in moved if namespace and not is_expression(namespace)}
+def _namespaces_with(name: str, requirement: Requirement, allowed: Collection[Right]) -> set[str]:
+    """Return the namespaces, except ``/``, in which names of rights end with ``name``.
+
+    If an enclave of the requirement, or of the node in ``name``, is in some of them, the result has
+    only these: in the others, another package may have the name.
+    """
+    moved = {of.name.removesuffix(name) for of in allowed if of.name.endswith(name)}
+    found = {namespace for namespace in moved if namespace and not is_expression(namespace)}
+    patterns = enclaves_of(requirement.elsewhere) if found and requirement.elsewhere else ()
+    own = [of.removeprefix(OTHER_NAMESPACE) for of in patterns if of.startswith(OTHER_NAMESPACE)]
+    own.append(name.rpartition("/")[0])
+    enclaves = {right.enclave for right in allowed} if found else ()
+    return {ns for ns in found if any(of and ns + of in enclaves for of in own)} or found
 
 
 def common_namespaces(requirements: Iterable[Requirement], rights: Iterable[Right]) -> set[str]:
@@ -879,7 +890,7 @@ def common_namespaces(requirements: Iterable[Requirement], rights: Iterable[Righ
 
     Only requirements with relative names count, and of these only names without wildcards.
     """
-    stated = {right.name for right in rights if right.qualifier is ALLOW}
+    allowed = [right for right in rights if right.qualifier is ALLOW]
     common: set[str] | None = None
     for requirement in requirements:
         if not requirement.is_relative or not isinstance(requirement, RightsRequirement):
@@ -887,7 +898,9 @@ def common_namespaces(requirements: Iterable[Requirement], rights: Iterable[Righ
         names = [name for _, of_right in requirement.rights for name in of_right]
         if all(map(is_expression, names)):
             continue
-        namespaces = set[str]().union(*(_namespaces_with(name, stated) for name in names))
+        namespaces = set[str]().union(
+            *(_namespaces_with(name, requirement, allowed) for name in names)
+        )
         common = namespaces if common is None else common & namespaces
     return common or set()
 

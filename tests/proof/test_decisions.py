@@ -625,13 +625,25 @@ def test_a_service_that_nobody_may_request_is_protected(
 
 @pytest.mark.parametrize(
     ("name", "namespaces", "is_told"),
-    [("x", (), True), ("/x", (), False), ("y", (), False), ("x", ("/middle",), False)],
+    [
+        ("x", (), True),
+        ("a/z", (), True),
+        ("/x", (), False),
+        ("y", (), False),
+        ("x", ("/middle",), False),
+    ],
 )
 def test_the_namespace_of_a_package_that_requirements_lack_is_named(
     name: str, namespaces: Sequence[str], is_told: bool
 ) -> None:
-    rights = {f"/{place}/a": may("publish", f"/{place}/x") for place in ("left", "right")}
-    text = f'[[only]]\npublish = ["{name}"]\nenclaves = ["/a"]'.encode()
+    """Another package has the same names in the namespace /cam."""
+    places = {"left": "a", "right": "a", "cam": "c"}
+    rights = {
+        f"/{place}/{own}": may("publish", f"/{place}/x", f"/{place}/a/z")
+        for place, own in places.items()
+    }
+    enclave = "/a" if name.endswith("x") else "//panel"
+    text = f'[[only]]\npublish = ["{name}"]\nenclaves = ["{enclave}"]'.encode()
     required = parse_requirements(text, "r.toml", namespaces=namespaces)
     (finding,) = (e for e in requirement_findings(required, robot(rights)) if e.id == VACUOUS)
     told = "its namespace on the robot: `--namespace /left --namespace /right`."
