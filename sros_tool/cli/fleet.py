@@ -352,12 +352,17 @@ def _collect(
             echo(line)
     print_notes((*collected.notes, *(published.notes if published else ())))
     if collected.has_new_files and not (folder or dry_run):
+        from sros_tool.keystore.delivery.collect import restored_command
+        from sros_tool.keystore.delivery.publish import unpublished_restore_clause
         from sros_tool.keystore.fleet import publish_command
+        from sros_tool.keystore.reader import OpenedKeystore
 
-        where = quote(str(root))
+        keystore = OpenedKeystore(root)
         deliver = publish_command(root) or (
-            f"`sros distribute_key {where} --robot NAME FOLDER --force`"
+            f"`sros distribute_key {quote(str(root))} --robot NAME FOLDER --force`"
         )
+        if unpublished_restore_clause(keystore):
+            deliver = restored_command(keystore)
         echo(
             f"the keystore has new files for robots; to bring them to the robots: {deliver}",
             err=True,

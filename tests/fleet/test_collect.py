@@ -54,8 +54,10 @@ from sros_tool.keystore.issuing.authority import load_authority
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, PUBLISHED, key_on_robot
-from sros_tool.keystore.ledger import RESTORED, certificate_entry
+from sros_tool.keystore.ledger import LATER_RELEASE, RESTORED, certificate_entry
 from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revocation_list import LostRecords
+from sros_tool.keystore.lifecycle.revoke import restore_revocations
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
@@ -846,17 +848,28 @@ def test_a_key_that_a_revoked_key_vouched_for(home: Home, revoked: int, is_repla
     assert KnownKeys(keystore).is_revoked(key_of_new) == is_replaced
 
 
-def test_the_verb_names_the_next_step(home: Home) -> None:
-    """Only where robots are to get new files, and nothing published them."""
+@pytest.mark.parametrize(
+    ("waits", "command"),
+    [(False, "distribute_key ks --robot NAME FOLDER --force"), (True, "publish ks PUB --restored")],
+)
+def test_the_verb_names_the_next_step(home: Home, waits: bool, command: str) -> None:
+    """Only where robots are to get new files, and nothing published them.
+
+    Nor is a robot that the backup lacks called a robot that left the fleet.
+    """
     crl, now = lose_revocations(home), datetime.now(UTC)
+    (home.folder / "inbox/r9").mkdir()
+    if waits:
+        lost = LostRecords(OpenedKeystore(home.root), now)
+        restore_revocations(home.root, lost, shown_by=LATER_RELEASE, now=now)
     home.send("r1", now)
-    assert "bring them" not in sros("fleet", "collect", "ks", "inbox", cwd=home.folder).err
+    said = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).err
+    assert "bring them" not in said
+    added = "read: r9. Perhaps a robot was added after the backup of the keystore: put it"
+    assert (added in said) is waits and ("r9. If a robot left the fleet" in said) is not waits
     home.send("r1", now, crl=foreign_list(home) + crl)
-    ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder)
-    assert (
-        "bring them to the robots: `sros distribute_key ks --robot NAME FOLDER --force`"
-        in ended.err
-    )
+    said = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).err
+    assert f"bring them to the robots: `sros {'fleet ' * waits}{command}`" in said and added in said
 
 
 def foreign_list(home: Home) -> str:

@@ -44,7 +44,7 @@ from sros_tool.keystore.confirmation import (
     store_confirmation,
     store_refusals,
 )
-from sros_tool.keystore.delivery.published import read_published
+from sros_tool.keystore.delivery.published import may_have_later_releases, read_published
 from sros_tool.keystore.delivery.restored import (
     LaterSeals,
     has_unpublished_restore,
@@ -277,6 +277,9 @@ def collect(
             is_restored=bool(signed),
             shows_later_releases=bool(forgotten.later_number),
         )
+        after = OpenedKeystore(root)
+        is_older = bool(forgotten.later_number or restored_at(after))
+        is_older |= may_have_later_releases(after)
         if not not_signed:
             not_signed, more_notes, more_signed = _sign(
                 root,
@@ -295,7 +298,11 @@ def collect(
         None,
         dry_run,
         [*changes, *signed],
-        [*_unknown_file_notes(inbox, fleet), *_older_message_notes(inbox, taken), *notes],
+        [
+            *_unknown_file_notes(inbox, fleet, is_older=is_older),
+            *_older_message_notes(inbox, taken),
+            *notes,
+        ],
     )
 
 
@@ -478,19 +485,28 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
     return _File(data, time_of_file(state.st_mtime))
 
 
-def _unknown_file_notes(inbox: Path, fleet: Fleet) -> Iterator[Note]:
-    """Yield a note on names in the inbox that are not names of robots."""
+def _unknown_file_notes(inbox: Path, fleet: Fleet, *, is_older: bool) -> Iterator[Note]:
+    """Yield a note on names in the inbox that are not names of robots.
+
+    ``is_older`` says that the keystore was restored, so that its fleet may lack robots.
+    """
     names: list[str] = []
     with suppress(OSError), os.scandir(inbox) as entries:  # others can move the folder at any time
         names = sorted(entry.name for entry in islice(entries, _MOST_NAMES))
     unknown = [ascii(name)[1:-1] for name in names if name not in fleet.robots]
     if unknown:
         verb = "is" if len(unknown) == 1 else "are"
+        left = "If a robot left the fleet, delete its messages there."
+        if is_older:
+            left = (
+                "Perhaps a robot was added after the backup of the keystore: put it into the fleet "
+                "file, and sign its requests again before `sros generate_artifacts` "
+                "(docs/howto/keystore_is_lost.md). If it left the fleet, delete its messages."
+            )
         yield Note(
             "fleet.unknown-in-inbox",
             f"{counted(len(unknown), 'name')} in '{inbox}' {verb} not in the fleet, and {verb} not "
-            f"read: {first_few(unknown, _SHOWN)}. If a robot left the fleet, delete its messages "
-            "there.",
+            f"read: {first_few(unknown, _SHOWN)}. {left}",
         )
 
 
@@ -1058,11 +1074,12 @@ def _later_release_notes(keystore: OpenedKeystore, robots: Sequence[str]) -> Ite
             "fleet.later-release",
             f"{have} a release that the keystore sealed but does not know: the keystore was "
             "restored from a backup, or is a copy. It publishes and renews again only after "
-            f"{_restored_command(keystore)}; docs/howto/keystore_is_lost.md has the other steps.",
+            f"{restored_command(keystore)}; docs/howto/keystore_is_lost.md has the other steps.",
         )
 
 
-def _restored_command(keystore: OpenedKeystore) -> str:
+def restored_command(keystore: OpenedKeystore) -> str:
+    """Return the command that publishes the first releases after a restore."""
     where = quote(str(keystore.root))
     folder = quote(read_published(keystore).folder or "PUB")
     return f"`sros fleet publish {where} {folder} --restored`"
@@ -1096,7 +1113,7 @@ def _defer_requests(
         return
     why = (
         f"the keystore was restored from a backup, or is a copy, so {reason}: first run "
-        f"{_restored_command(keystore)}"
+        f"{restored_command(keystore)}"
     )
     for request in requests:
         if has_lost_releases or request.is_new_key:
