@@ -35,8 +35,9 @@ from sros_tool.proof.escapes import (
 )
 from sros_tool.proof.findings import Decisions, decide_all, decided_findings, requirement_findings
 from sros_tool.proof.requirements import (
-    Apart,
+    AtMost,
     DroppedRequirement,
+    NotBoth,
     Requirement,
     dropped_findings,
     dropped_requirements,
@@ -320,16 +321,17 @@ def _namespaces_to_try(
     for placed in chain.from_iterable(map(placed_rights, enclaves)):
         names = fixed if placed.written.startswith(("/", "*")) else moving
         names.add(placed.right.name)
-    changed = fixed.intersection(right.name for right in before.rights ^ after.rights)
+    changed = {right.name for right in before.rights ^ after.rights}
     ordinary = "/any_namespace"
     while any(ordinary in right.name for right in (*before.rights, *after.rights)):
         ordinary += "_"
     relative = [requirement for requirement in requirements if requirement.is_relative]
     required = {name for requirement in relative for name in names_of(requirement)}
-    if any(isinstance(requirement, Apart) for requirement in relative):
-        required |= moving  # by any name, enclaves may influence each other
-    by_changed_name = Names(sorted(changed))
-    ordered = [*dict.fromkeys(namespaces_in([*sorted(changed), *sorted(fixed)]))]
+    # A changed name that moves may break these only together with names that do not move.
+    are_joined = any(isinstance(requirement, AtMost | NotBoth) for requirement in relative)
+    by_changed_name = Names(sorted(fixed if are_joined and changed & moving else fixed & changed))
+    names_in_order = sorted(fixed, key=lambda name: (name not in changed, name))
+    ordered = [*dict.fromkeys(namespaces_in(names_in_order))]
     matching = [
         namespace
         for namespace in ordered

@@ -1975,6 +1975,34 @@ def test_a_wildcard_that_leaves_out_one_namespace_breaks_requirements_in_others(
 
 
 @pytest.mark.parametrize(
+    ("required", "writer", "added"),
+    [
+        ('[[at_most]]\npublish = ["x"]\nenclaves = 1\n', "/b", "x"),
+        ('[[not_both]]\nfirst.publish = ["x"]\nsecond.publish = ["v"]\n', "/a", "v"),
+    ],
+)
+def test_a_name_that_moves_breaks_a_requirement_with_names_that_do_not(
+    change: Change, monkeypatch: pytest.MonkeyPatch, required: str, writer: str, added: str
+) -> None:
+    """The change adds no name in the namespace, which is still tried before others."""
+    robot = {"/a": ["w"], "/b": ["/b1/z", "/b2/z"], "/d": ["v"]}
+    robot["/e"] = ["x"] if added == "v" else ["w"]
+    robot[writer].append("/c/x")
+    heard = {"/r": subscribe("x", "v")}
+
+    def text() -> str:
+        return policy_text(heard | {path: publish(*names) for path, names in robot.items()})
+
+    change.base = change.commit({"robot.xml": text(), "robot.toml": required})
+    robot["/a"].append(added)
+    change.commit({"robot.xml": text()})
+    monkeypatch.setattr(reviewed_requirements, "MOST_NAMESPACES", 2)
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    ended = change.review(*asked)
+    assert ": in namespace /c, which the review tries" in ended.out, ended
+
+
+@pytest.mark.parametrize(
     ("names", "status", "said"),
     [
         # Namespaces in which no requirement has the name come last.
