@@ -47,7 +47,7 @@ from sros_tool.keystore.delivery.publish import age_clause
 from sros_tool.keystore.delivery.publish import publish as publish_releases
 from sros_tool.keystore.delivery.published import read_published, releases_in
 from sros_tool.keystore.delivery.release import seal_releases
-from sros_tool.keystore.delivery.signing import certify_requests
+from sros_tool.keystore.delivery.signing import certify_requests, sign_request
 from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.authority import load_authority
@@ -57,7 +57,7 @@ from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, PUBLISHED, key_on_r
 from sros_tool.keystore.ledger import LATER_RELEASE, RESTORED, certificate_entry
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import LostRecords
-from sros_tool.keystore.lifecycle.revoke import restore_revocations
+from sros_tool.keystore.lifecycle.revoke import restore_revocations, revoke
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
@@ -65,7 +65,7 @@ from sros_tool.pki.crl import SUPERSEDED, RevocationEntry, load_crl, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
 from sros_tool.validity import BACKDATE, iso, parse_iso
 from tests.dds.signer_rows import signed_by
-from tests.support.harness import copy_of, policy_text, publish, sros
+from tests.support.harness import copy_of, create_request, policy_text, publish, sros
 from tests.support.messages import key_of, said_by, signed_message
 from tests.support.users import as_root
 
@@ -485,6 +485,55 @@ def test_new_keys_end_the_alarm_of_two_computers(
         sros("rotate_ca", "ks", "--next", cwd=home.folder).ok()
         refused = sros("rotate_ca", "ks", "--next", cwd=home.folder).err
         assert "Two computers seem to have the keys of r1, so their confirmations" in refused
+
+
+@pytest.mark.parametrize("before", ["", "rotated", "restored", "shown"])
+def test_a_new_computer_begins_again_after_one_whose_clock_was_ahead(
+    home: Home, before: str
+) -> None:
+    """It made its own keys. No message with an earlier key counts, nor one from an earlier time.
+
+    Of a certificate that only a release showed after a restore, nobody knows the time of issue.
+    """
+    now = datetime.now(UTC)
+    names = ["/r1/arm", "/r1/base"]
+    if before == "rotated":
+        home.run("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+        home.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
+    elif before == "restored":
+        lost = LostRecords(OpenedKeystore(home.root), now)
+        restore_revocations(home.root, lost, shown_by=LATER_RELEASE, now=now)
+    old = home.message("r1", now)
+    home.sequence = 10**9
+    home.send("r1", now)
+    assert home.of("r1", now).outcome == "kept"
+    now += timedelta(hours=1)
+    backup = copy_of(home.root, home.folder / "backup")
+    revoke(home.root, names, now=now)
+    for name in names:
+        request = create_request(home.folder / "new", name).file.read_bytes()
+        sign_request(home.root, request, only_enclaves=[name], now=now)
+    shutil.copytree(home.root / "enclaves/r1", home.folder / "new/enclaves/r1", dirs_exist_ok=True)
+    shutil.rmtree(home.folder / "r1")
+    (home.folder / "new").rename(home.folder / "r1")
+    if before == "shown":
+        lost = LostRecords(OpenedKeystore(home.root), now)
+        lost.add_certificate(home.certificate("/r1/base"))
+        shutil.rmtree(home.root)
+        backup.rename(home.root)
+        renew(home.root, names, new_key=True, revoke_old=True, now=now)
+        restore_revocations(home.root, lost, now=now)
+    home.sequence = 0
+    early = home.message("r1", now - timedelta(minutes=1))
+    now += timedelta(hours=1)
+    good = home.message("r1", now)
+    outcomes = []
+    for message in (old, early, good, old, early):
+        home.put("r1", message, now)
+        outcomes.append(home.of("r1", now).outcome)
+    of_early = "refused" if before in ("restored", "shown") else "kept"
+    of_good = "refused" if before == "shown" else "kept"
+    assert outcomes == ["refused", of_early, of_good, "refused", "refused"]
 
 
 def test_no_file_with_an_early_time_brings_an_old_message_back(home: Home) -> None:

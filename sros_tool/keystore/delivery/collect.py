@@ -54,7 +54,7 @@ from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.known_keys import restored_at, revoked_serials
+from sros_tool.keystore.known_keys import KnownKeys, restored_at, revoked_serials
 from sros_tool.keystore.layout import CERTIFICATE_FILE, IDENTITY, confirmation_file, enclave_folder
 from sros_tool.keystore.ledger import LATER_RELEASE, REPORTED, Entry
 from sros_tool.keystore.lifecycle.change import ChangeOptions, KeystoreChange
@@ -577,10 +577,8 @@ class _Verifier:
         if before and before.sha256 == sha256:
             return _ReceivedMessage(robot, "unchanged", verified=verified, remarks=remarks)
         is_restored = robot.name in self._restored
-        if before and last and sequence <= before.sequence and not restored_at(self._keystore):
-            # A new computer begins again: nobody could sign an old message with its keys.
-            is_new = self._came_after(verified.certificate, last)
-            is_restored |= is_new and self._has_new_keys(robot, last)
+        if before and last and sequence <= before.sequence:
+            is_restored |= self._begins_again(robot, verified, last)
         is_older = before is not None and sequence < before.sequence and not is_restored
         # A message that came later may be from a robot with a restored disk, or may be replayed.
         if is_older and last and file.written < last.time:
@@ -590,8 +588,8 @@ class _Verifier:
             raise _RefusedError(
                 f"its sequence number {sequence} is not higher than {before.sequence}, the number "
                 "of the last message: this is an old message, two computers have the robot's "
-                "keys, or the disk of the robot was restored (only then add --restored "
-                f"{robot.name})"
+                "keys, or the robot's clock was ahead before its disk was restored or its computer "
+                f"was replaced (only then add --restored {robot.name})"
             )
         arrived = self._arrival(file, verified.confirmation, last)
         message = LastMessage(
@@ -607,7 +605,7 @@ class _Verifier:
             if not restored_at(self._keystore):
                 went_back = is_earlier_start = False
                 boots, alternated = message.next_boots(boot, arrived)
-            elif last.is_alternation_shown and self._came_after(verified.certificate, last):
+            elif last.is_alternation_shown and self._issue_after(verified.certificate, last):
                 # The ledger may lack an earlier certificate: the problem stays for its day.
                 went_back = is_earlier_start = False
                 alternated = before.alternated if before else None
@@ -658,7 +656,9 @@ class _Verifier:
             for entry in self._keystore.ledger_file.with_values("enclave", names).entries
             if entry.what == "certificate" and entry.enclave in names
         ]
-        earlier = [entry for entry in entries if entry.time <= iso(last.latest)]
+        # Nobody knows when a certificate was issued that only releases showed after a restore.
+        shown = KnownKeys(self._keystore).certificates_shown_after_restore(names)
+        earlier = [entry for entry in entries if entry.time <= iso(last.latest) or entry in shown]
         later_keys = {entry.key for entry in entries if entry not in earlier}
         return bool(earlier) and all(
             entry.key not in {"", *later_keys}
@@ -666,10 +666,26 @@ class _Verifier:
             for entry in earlier
         )
 
-    def _came_after(self, certificate: x509.Certificate, last: ReceivedConfirmation) -> bool:
-        """Return whether a certificate was issued after a message, according to the ledger."""
+    def _issue_after(
+        self, certificate: x509.Certificate, last: ReceivedConfirmation
+    ) -> Entry | None:
+        """Return the ledger's entry for a certificate if it is from after a message, or None."""
         issued = self._issue_entry(digest(certificate))
-        return issued is not None and issued.time > iso(last.latest)
+        return issued if issued and issued.time > iso(last.latest) else None
+
+    def _begins_again(
+        self, robot: Robot, verified: _VerifiedMessage, last: ReceivedConfirmation
+    ) -> bool:
+        """Return whether a message is from a new computer, with keys that came after ``last``.
+
+        After a restore, the ledger may lack an earlier certificate for the same key, with which an
+        old message was signed: then, the message must also be from after its certificate.
+        """
+        issued = self._issue_after(verified.certificate, last)
+        if issued is None or not self._has_new_keys(robot, last):
+            return False
+        is_later = iso(verified.confirmation.time) >= issued.time
+        return is_later or not restored_at(self._keystore)
 
     def _arrival(
         self, file: _File, confirmation: Confirmation, last: ReceivedConfirmation | None
