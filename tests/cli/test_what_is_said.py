@@ -54,7 +54,7 @@ def test_what_still_works_after_taking_a_right_away(verb: str, root: Path) -> No
     assert "/robot loses: publish topic /secret" in ended.err
     (line,) = [each for each in ended.err.splitlines() if "it lost still work until" in each]
     assert f"{validity_of(before).not_after:%Y-%m-%d}" in line
-    assert "until their restart" in line
+    assert "have these rights until they are restarted" in line
     assert OLD_PROGRAM in ended.err
     # What it names as the remedy runs, and ends it.
     (command,) = commands(line)

@@ -330,7 +330,8 @@ def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
         return ""
     ends = [rights.works_until for rights in lasting if rights.works_until]
     at_least = "at least " if any(rights.may_work_longer for rights in lasting) else ""
-    work = f"still work {at_least}until {iso(max(ends))}" if ends else "may still work"
+    latest = " at the latest" if len({*ends}) > 1 and not at_least else ""
+    work = f"still work {at_least}until {iso(max(ends))}{latest}" if ends else "may still work"
     names = [rights.enclave for rights in lasting]
     if len(names) == 1:
         lost, kept = f"{names[0]}: the rights that it lost", "its earlier permissions and its key"
@@ -341,7 +342,7 @@ def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
     which = " ".join(map(quote, names)) if len(names) <= _ENCLAVES_SHOWN else "ENCLAVE..."
     others = "" if len(names) <= _ENCLAVES_SHOWN else " (or with --robot NAME, or --all)"
     return (
-        f"{lost} {work}: for whoever kept {kept}, and in running processes until their restart. "
-        f"To end these rights, run `sros renew {quote(str(root))} {which} --revoke-old`{others}, "
-        f"and restart all processes, first those of {owner}."
+        f"{lost} {work} for whoever kept {kept}; running processes have these rights until they "
+        f"are restarted. To end these rights, run `sros renew {quote(str(root))} {which} "
+        f"--revoke-old`{others}, and restart all processes, first those of {owner}."
     )
