@@ -25,6 +25,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
 from sros_tool.agent.inbox import RefusedError, send
 from sros_tool.agent.install import (
+    DiskFullError,
     Installation,
     install_release,
     present_lists,
@@ -163,6 +164,8 @@ class Round(NamedTuple):
     """Enclaves of which a file changed."""
     removed: Sequence[str]
     """Enclaves that were removed, because the release does not have them."""
+    lists: Sequence[str]
+    """Enclaves that got only the revocation list of a new release, because the disk is full."""
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
     unseen: Sequence[str]
@@ -311,6 +314,7 @@ class _Round:
             fetched,
             installation.changed,
             installation.removed,
+            installation.lists,
             self._state.due,
             self._state.unseen,
             self._restarts.units,
@@ -715,7 +719,7 @@ class _Round:
             )
         except (SrosError, OSError) as error:
             self._note_error(error)
-            return Installation()
+            return Installation(lists=error.lists if isinstance(error, DiskFullError) else ())
         for name, why in installation.kept.items():
             remedy = _BRING_KEY.format(settings.robot) if concerns_key(why) else ""
             self._problems.append(f"{name} does not get the files of the release: {why}.{remedy}")

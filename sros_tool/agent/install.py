@@ -77,6 +77,14 @@ _DATED_FILES = (CERTIFICATE_FILE, PERMISSIONS_FILE, PERMISSIONS_CA_FILE, *LIST_F
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
+class DiskFullError(OSError):
+    """The disk is full; at most revocation lists were written, those of the enclaves ``lists``."""
+
+    def __init__(self, error: OSError, lists: Sequence[str]) -> None:
+        super().__init__(error.errno, error.strerror, error.filename)
+        self.lists = tuple(lists)
+
+
 class Installation(NamedTuple):
     """The outcome for the enclaves of a release; an enclave that did not change is in no field."""
 
@@ -93,6 +101,8 @@ class Installation(NamedTuple):
     """
     made: datetime | None = None
     """The newest date of the certificates and revocation lists of the whole release."""
+    lists: tuple[str, ...] = ()
+    """Enclaves that got only the revocation list, because the disk is full."""
 
 
 @dataclass(slots=True)
@@ -139,8 +149,8 @@ def install_release(
     Raises:
         KeystoreError: the release as a whole is not for this folder, or is older than the files
             here; nothing was changed.
-        OSError: nothing could be written, for example because the disk is full; the revocation
-            lists were installed if there was room for them.
+        DiskFullError: the disk is full; the revocation lists were installed if there was room.
+        OSError: nothing could be written.
     """
     recover_keystore(folder)
     _check_folder(folder)
@@ -574,15 +584,14 @@ def _apply_changes(folder: Path, changes: Mapping[str, _Change]) -> dict[str, st
     Return the enclaves that could not be changed, and why.
 
     Raises:
-        OSError: the disk is full; at most revocation lists were written.
+        DiskFullError: the disk is full; at most revocation lists were written.
     """
     try:
         _write_changes(folder, changes.values())
         return {}
     except (SrosError, OSError) as error:
         if isinstance(error, OSError) and error.errno in _DISK_FULL:
-            _commit_lists(folder, changes.values())
-            raise
+            raise DiskFullError(error, _commit_lists(folder, changes)) from error
         first = error
     if len(changes) == 1:
         return {name: _error_clause(first) for name in changes}
@@ -617,16 +626,21 @@ def _refuse_changed_files(folder: Folder, change: _Change) -> None:
             )
 
 
-def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
-    """Write the new revocation lists of enclaves whose identity CAs stay, if the disk has room."""
-    lists = []
-    for change in changes:
+def _commit_lists(folder: Path, changes: Mapping[str, _Change]) -> Sequence[str]:
+    """Write the new revocation lists of enclaves whose identity CAs stay, if the disk has room.
+
+    Return the enclaves whose lists were written.
+    """
+    lists = {}
+    for name, change in changes.items():
         crls = {path: data for path, data in change.write.items() if path.endswith(f"/{CRL_FILE}")}
         if crls and not any(path.endswith(f"/{IDENTITY_CA_FILE}") for path in change.write):
-            lists.append(_Change(write=crls, seen=change.seen))
+            lists[name] = _Change(write=crls, seen=change.seen)
     with suppress(SrosError, OSError):
         if lists:
-            _write_changes(folder, lists)
+            _write_changes(folder, lists.values())
+            return sorted(lists)
+    return ()
 
 
 def _error_clause(error: SrosError | OSError) -> str:

@@ -334,11 +334,16 @@ def _round_lines(folder: Path, finished_round: Round, *, restarted: bool) -> Ite
         if finished_round.removed
         else []
     )
+    if lists := len(finished_round.lists):
+        of_enclaves = "list of 1 enclave was" if lists == 1 else f"lists of {lists} enclaves were"
+        changes = [f"only the revocation {of_enclaves} installed"]
     no_change = "nothing changed" if finished_round.fetched else "nothing could be fetched"
     yield f"{release}: {', '.join(changes) or no_change}"
     if restarted and finished_round.unseen:
+        has_new_files = not {*finished_round.changed}.isdisjoint(finished_round.unseen)
         yield (
-            "--restarted does not count for files that this round installed: files of "
+            "--restarted does not count for files that this round "
+            f"{'installed' if has_new_files else 'could not install yet'}: files of "
             f"{first_few(finished_round.unseen, _MOST_SHOWN)}"
         )
     for unit in finished_round.restarted:

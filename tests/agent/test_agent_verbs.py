@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from sros_tool.agent import install
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki.certificates import validity_of
 from sros_tool.runtime.processes import ProcessTable, RunningProcesses, UnseenProcess
@@ -235,6 +237,33 @@ def test_a_release_of_which_an_enclave_lacks_its_key(world: World) -> None:
     assert re.search(
         "^robot r1: release [0-9]+, not yet", world.run("agent", "status", "robot").out
     )
+
+
+def test_a_full_disk_with_room_for_the_revocation_list(world: World) -> None:
+    """The list is installed once; what --restarted counts for is said, too."""
+    world.monkeypatch.setattr(ProcessTable, "look", lambda *_: CLOSED)
+    world.run(*INIT).ok()
+    world.agent("--restarted").ok()
+    for words in ("revoke ks --robot r2", "renew ks --robot r1", "fleet publish ks pub"):
+        world.run(*words.split()).ok()
+    write = install._write_changes
+
+    def fill(folder: Path, changes: Collection[install._Change]) -> None:
+        if any(not path.endswith("/crl.pem") for change in changes for path in change.write):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(folder, changes)
+
+    could_not = "not count for files that this round could not install yet: files of /r1/a, /r1/b"
+    with world.monkeypatch.context() as patched:
+        patched.setattr(install, "_write_changes", fill)
+        for option, said, counts in (
+            ([], "only the revocation lists of 2 enclaves were installed", ""),
+            (["--restarted"], "nothing changed", could_not),
+        ):
+            ended = world.agent(*option)
+            assert ended.out.splitlines()[0].endswith(said), ended.out
+            assert counts in ended.out and "No space left on device" in ended.err
+    assert "that this round installed: files of /r1/a, /r1/b" in world.agent("--restarted").out
 
 
 def test_a_folder_of_another_robot_gets_no_agent(world: World) -> None:
