@@ -21,7 +21,7 @@ from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.validity import Window, iso, parse_duration, time_of_file
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import capitalized, counted, first_few
 
 IF_EXPIRED = "If files that processes loaded have expired, restart all processes together."
 ONE_BY_ONE = f"restart the processes one by one; meanwhile, all of them communicate. {IF_EXPIRED}"
@@ -254,7 +254,7 @@ def refuse_unreadable(
             what = enclave.error.what
             alike.setdefault(what.replace(enclave.name, ""), []).append(what)
         reasons = " ".join(
-            f"{whats[0]}{f' ({len(whats)} such enclaves)' if whats[1:] else ''}."
+            f"{capitalized(whats[0])}{f' ({len(whats)} such enclaves)' if whats[1:] else ''}."
             for whats in alike.values()
         )
         first = unreadable[0]
