@@ -128,7 +128,6 @@ if TYPE_CHECKING:
     from sros_tool.keystore.delivery.repository import NewMetadata, Roots
     from sros_tool.keystore.issuing.authority import Authority
 
-"""The roles whose keys must be in the keystore."""
 _METADATA, _TARGETS, _ARCHIVES = "metadata", "targets", "targets/robots"
 _MOST_NAMES = 3
 """Maximum number of enclaves that a message names."""

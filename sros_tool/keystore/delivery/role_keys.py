@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 _ROLES = ("root", "targets", "snapshot", "timestamp")
 _ONLINE = _ROLES[1:]
+"""The roles whose keys must be in the keystore."""
 _BEFORE = "before"
 
 
