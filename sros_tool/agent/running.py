@@ -403,7 +403,13 @@ def restart_units(
     except UnavailableError as error:
         active = frozenset()
         problems.append(str(error))
-    units = _due_units(settings, due_enclaves, routers, active)
+    units: list[Unit] = []
+    for unit in _due_units(settings, due_enclaves, routers, active):
+        if broken := [name for name in unit.enclaves if name in unusable]:
+            why = f"no process could start in {broken[0]}: {unusable[broken[0]]}"
+            problems.append(f"{unit.name} is not restarted: {why}.")
+        else:
+            units.append(unit)
     if units and settings.restart_if:
         try:
             allowed = subprocess.run(
@@ -420,10 +426,6 @@ def restart_units(
         if allowed.returncode:
             return Restarts(waiting=units, problems=problems)
     for unit in units:
-        if broken := [name for name in unit.enclaves if name in unusable]:
-            why = f"no process could start in {broken[0]}: {unusable[broken[0]]}"
-            problems.append(f"{unit.name} is not restarted: {why}.")
-            continue
         try:
             systemd.restart(unit.name)
         except UnavailableError as error:

@@ -1078,6 +1078,8 @@ def test_no_unit_restarts_that_could_not_start_or_must_not(home: Home, r1: Robot
     done = r1.round()
     assert done.restart == done.waiting == r1.message().waiting == NAMES and not r1.systemctl
     (r1.folder / "enclaves/r1/a/key.pem").unlink()
+    done = r1.round()
+    assert done.restart == NAMES and done.waiting == r1.message().waiting == NAMES[1:]
     r1.settings = replace(r1.settings, restart_if=("/no/command",))
     why = "did not start or end: [Errno 2] No such file or directory: '/no/command'."
     assert any(problem.endswith(why) for problem in r1.round().problems)
