@@ -567,12 +567,18 @@ class _Round:
     def _own_enclaves(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return the enclaves ``names`` that the accepted release has.
 
-        Before the first release, and without a readable seal, all are returned.
+        If none is here, somebody has perhaps replaced all of them by hand: then newer enclaves are
+        returned that do not seem to be those of another robot.  Before the first release, and
+        without a readable seal, all are returned.
         """
         if self._state.accepted:
             with suppress(SrosError):  # the next installation writes the seal again
                 released = self._released_files()
-                return tuple(name for name in names if _certificate_path(name) in released)
+                if own := [name for name in names if _certificate_path(name) in released]:
+                    return tuple(own)
+                newer = self._newer_enclaves().intersection(names)
+                foreign = self._seemingly_foreign(sorted(newer), released)
+                return tuple(sorted(newer.difference(foreign)))
         return tuple(names)
 
     def _note_repaired_files(self, now: datetime) -> None:

@@ -372,6 +372,19 @@ def test_an_enclave_of_another_robot_that_is_newer_than_the_release(home: Home, 
     assert not done.sent and any("No enclave of this robot's release" in x for x in done.problems)
 
 
+def test_an_enclave_brought_in_place_of_all_that_the_release_has_signs(
+    home: Home, r1: Robot
+) -> None:
+    r1.round()
+    brought = r1.folder / "enclaves/r1/new"
+    shutil.move(r1.folder / "enclaves/r1/a", brought)
+    (brought / "cert.pem").write_bytes(home.renewed.files["enclaves/r1/a/cert.pem"])
+    for name in ("b", "c"):
+        shutil.rmtree(r1.folder / "enclaves/r1" / name)
+    done = r1.round()
+    assert done.sent and any("/r1/new is newer than release 1" in each for each in done.problems)
+
+
 def test_a_removed_enclave_is_named_until_its_certificate_is_revoked_or_a_release_has_it(
     home: Home, r1: Robot
 ) -> None:
