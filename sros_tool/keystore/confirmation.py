@@ -55,6 +55,8 @@ LONGEST_REASON = 400
 """Maximum number of characters in the reason for refusing a message."""
 NOT_IN_LEDGER = "its certificate is not in the ledger of the keystore"
 """How the reason begins for refusing a message whose certificate the ledger does not record."""
+LOW_SEQUENCE = "its sequence number"
+"""How the reason begins for refusing a message that does not come after the last message."""
 _MOST_REFUSALS = 64 * 1024 * 1024
 """Largest size of the file of refused messages, in bytes; enough for 100,000 robots.
 

@@ -32,6 +32,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
     EXPIRED_METADATA,
+    LOW_SEQUENCE,
     NOT_IN_LEDGER,
     OF_OTHER_CA,
     Confirmation,
@@ -238,6 +239,7 @@ class RobotStatus:
     - ``has_shared_keys``: two computers seem to have its keys;
     - ``may_trust_replaced``: one of its processes may trust an identity CA that was replaced;
     - ``is_behind``: its clock is earlier than documents that it has verified;
+    - ``has_low_sequence``: its last message was refused because of its sequence number;
     - ``reported``: how many of its problems are in its own words; they come first in ``problems``.
     """
 
@@ -335,6 +337,7 @@ class RobotStatus:
     lacks_ca: bool = False
     reported: int = 0
     is_behind: bool = False
+    has_low_sequence: bool = False
 
     @property
     def is_published(self) -> bool:
@@ -486,6 +489,8 @@ class RobotStatus:
         if (self.published or 0) == (self.release or 0):
             return "find out why" if self.is_published else "publish"
         is_silent = self.confirmed is None or now - self.confirmed > _FETCH_EXPECTED_WITHIN
+        if self.has_low_sequence:  # perhaps it has fetched already
+            return "find out why"
         if self.is_locked_out(now):
             return "deliver" if is_silent else "wait, else deliver"
         if self._is_overdue_by_clock(now, _FETCH_EXPECTED_WITHIN):
@@ -1681,6 +1686,7 @@ def _robot_status(
         lacks_ca=facts.fetches and records.lacks_ca(compared_robot, is_published=facts.has_release),
         reported=len(facts.reported),
         is_behind=bool(confirmed and confirmed.clock is RobotClock.BEHIND),
+        has_low_sequence=bool(facts.refusal and facts.refusal.why.startswith(LOW_SEQUENCE)),
     )
 
 

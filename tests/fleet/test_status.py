@@ -34,6 +34,7 @@ from sros_tool.cli.fleet import (
     _robot_names,
 )
 from sros_tool.keystore.confirmation import (
+    LOW_SEQUENCE,
     MESSAGE_FILE,
     READABLE_KEYS,
     REPLACED_FILES,
@@ -44,6 +45,8 @@ from sros_tool.keystore.confirmation import (
     RunningFiles,
     parse_confirmation,
     problem_rank,
+    refusals,
+    store_refusals,
 )
 from sros_tool.keystore.fleet_metrics import fleet_metrics
 from sros_tool.keystore.fleet_status import FleetStatus, State, _KeystoreRecords, fleet_status
@@ -1326,6 +1329,14 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     waits = "1 revoked certificate: the new one waits for the robot"
     assert rows["r3"][0] == "wait, else deliver"
     assert rows["r3"][1].startswith(f"{waits}; {refused}; ")
+    for refused_now, to_do in (
+        ({"r3": LOW_SEQUENCE}, "find out why"),
+        ({"r3": "it is damaged"}, "wait, else deliver"),
+        ({}, "wait, else deliver"),
+    ):
+        keystore = OpenedKeystore(field.root)
+        store_refusals(keystore, refusals(keystore), refused_now, now=datetime.now(UTC))
+        assert said()["r3"][0] == to_do
     assert rows["r2"][0] == "wait: it fetches"
     kept = field.root / "confirmed/r2.json"
     value = json.loads(kept.read_text())

@@ -30,6 +30,7 @@ from sros_tool.fleet.robots import RENEWAL_ALLOWED, Fleet, Robot, enclaves_of, r
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     LONGEST_REASON,
+    LOW_SEQUENCE,
     MAX_BYTES,
     MESSAGE_FILE,
     NOT_IN_LEDGER,
@@ -586,7 +587,7 @@ class _Verifier:
             return _ReceivedMessage(robot, "older", crl=said.crl, seal=said.seal, remarks=remarks)
         if before and sequence <= before.sequence and not is_restored:
             raise _RefusedError(
-                f"its sequence number {sequence} is not higher than {before.sequence}, the number "
+                f"{LOW_SEQUENCE} {sequence} is not higher than {before.sequence}, the number "
                 "of the last message: this is an old message, two computers have the robot's "
                 "keys, or the robot's clock was ahead before its disk was restored or its computer "
                 f"was replaced (only then add --restored {robot.name})"
