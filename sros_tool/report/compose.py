@@ -185,7 +185,7 @@ def overlay(
         overlay=_OVERLAYS[kind],
         differences=_unused_rights(edges) if kind == "use" else _overlay_differences(*rights),
         enclaves=tuple(
-            replace(e, observed=is_unclear, note=e.note or "perhaps observed" * is_unclear)
+            replace(e, observed=is_unclear, note="perhaps observed" * is_unclear)
             if e.path in unseen
             else e
             for e in picture.enclaves

@@ -318,7 +318,7 @@ class _Draft:
             if enclave.path in self._unit_of:
                 owner, group = owners[enclave.path], self._text(enclave.group)
                 drawn = (
-                    *(owner.form, group.form, enclave.observed, enclave.domains),
+                    *(owner.form, group.form, enclave.observed, enclave.note, enclave.domains),
                     *(enclave.path in alarming, roles.get(enclave.path)),
                 )
                 yield self._kind_number(drawn), (*owner.units, *group.units), enclave.path
@@ -608,6 +608,7 @@ class _Draft:
                     equal = self._unit_names(self._classes[self._inside[unit]])
                     note = f"{len(equal)} equal enclaves"
                 path, group = self._path(enclave.path), self._text(enclave.group).fill(self._label)
+                note = ", ".join(filter(None, (note, enclave.note)))
                 yield replace(enclave, path=path, group=group, note=note)
 
     def _folded_focus(self, focus: Focus) -> Focus:

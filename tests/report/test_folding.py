@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.report.compose import PictureSource, compose, overlay
 from sros_tool.report.focus import focused_picture
 from sros_tool.report.folding import Folding
-from sros_tool.report.picture import Picture, SourceTitle
+from sros_tool.report.picture import Picture, PicturedFinding, SourceTitle
 from tests.report.pictures import group, picture_of, source_of
 from tests.support.harness import policy_text, sros
 
@@ -237,6 +238,16 @@ def test_what_is_drawn_is_exactly_what_is_there(rights: frozenset[Right], part: 
     base = {Right(f"/{name}{part}", ALLOW, "publish", f"/{name}/t") for name in ("a", "b", "c")}
     picture = compose(PictureSource(SourceTitle("x", "policy"), rights | base))
     literal(Folding.of(picture), picture)
+
+
+def test_robots_that_were_perhaps_observed_are_not_drawn_as_observed(tmp_path: Path) -> None:
+    seen = {path: rights for path, rights in fleet().items() if "/r5/" not in path}
+    lost = PicturedFinding("graph.unknown-enclave", "note", "nodes without a known enclave")
+    observation = replace(source_of(tmp_path, seen, "seen.xml"), findings=(lost,))
+    picture = overlay(source_of(tmp_path, fleet()), observation, "use")
+    notes = {e.path: e.note for e in Folding.of(picture).picture.enclaves}
+    assert notes["/r5/base"].endswith("perhaps observed")
+    assert notes["/{r1…r12}/base"] == ""
 
 
 def test_names_without_the_other_side_are_marked_everywhere(tmp_path: Path) -> None:
