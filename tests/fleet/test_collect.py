@@ -919,6 +919,11 @@ def test_the_verb_names_the_next_step(home: Home, waits: bool, command: str) -> 
     home.send("r1", now, crl=foreign_list(home) + crl)
     said = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).err
     assert f"bring them to the robots: `sros {'fleet ' * waits}{command}`" in said and added in said
+    # Where nothing was published, no publication would ever end this refusal.
+    (home.folder / "fleet.toml").write_text("[robots]\nr1 = {}\nr3 = {}\nr9 = {}\n")
+    generate = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    refused = sros(*generate, cwd=home.folder).err
+    assert ("create /r9/base, /r9/arm with new keys, but a robot may have" in refused) is waits
 
 
 def foreign_list(home: Home) -> str:
