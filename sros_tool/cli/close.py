@@ -293,7 +293,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
             f"not on this machine: {', '.join(not_here)} (to bring an enclave to its machine: "
             f"{bring})"
         )
-    revoked = {entry.enclave for entry in revoked_entries(keystore)}
+    revoked = {entry.enclave for entry in revoked_entries(keystore)}.difference(outside)
     if dropped := [
         name for name in robot.processes.enclaves_outside(policy) if name not in revoked
     ]:

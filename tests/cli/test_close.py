@@ -1677,6 +1677,9 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     talker = r'(?s)<enclave path="/talker">.*?</enclave>'
     policy.write_text(re.sub(talker, "", policy.read_text()))
     assert "saw when it watched: /talker\n" in robot.close(status=1).out
+    renewal = ("robot/keystore", "/talker", "--new-key", "--revoke-old")
+    sros("renew", *renewal, cwd=robot.folder).ok()
+    assert "saw when it watched: /talker\n" in robot.close(status=1).out, "only a key is revoked"
     sros("revoke", "robot/keystore", "/talker", cwd=robot.folder).ok()
     assert "saw when it watched" not in robot.close().out, "the user took the enclave out"
 
