@@ -543,14 +543,11 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     robot, observed = running.robot, state.observed
     close = robot.close_command
     silent = "Otherwise, nobody would hear {} any more (--accept nodes accepts this)"
-    policy = robot.read_policy()
-    idle = {
-        enclave.path: {profile.full_name for profile in enclave.all_profiles()}
-        for enclave in (policy.enclaves if policy and state.secured else ())
-        if enclave.path in state.stopped
-    }
+    policy = robot.read_policy() if state.secured else None
+    nodes, stopped = policy.nodes() if policy else {}, state.stopped
+    idle = {enclave: names for enclave, names in nodes.items() if enclave in stopped}
     named = running.named_processes(observed, idle)
-    named = {text: named[text] for text in named if not named[text].unit}
+    named = {text: process for text, process in named.items() if not process.unit}
     for text, process in named.items():
         label, start = text.partition(": ")[0], process.secured_command(robot.folder.absolute())
         yield (
@@ -564,7 +561,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
             advice += ". If sros still sees no node, add the node's name to the command of "
             advice += f"each process ({_REMAP})"
         if state.secured:
-            left = {*state.stopped} - {process.enclave for process in named.values()}
+            left = stopped - {process.enclave for process in named.values()}
             advice = _start_of_unknown_process(running, unknown, sorted(left), observed)
             advice += (
                 "Stop processes that are not of the robot, such as your own `sros demo listener`"
