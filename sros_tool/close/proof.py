@@ -391,8 +391,8 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
 def _connecting_processes(running: RunningRobot) -> tuple[list[Process], list[Process]]:
     """Return the robot's processes, and further processes of its domain that trust the same CA.
 
-    The latter have other files, or only claim to run in an enclave. The observer, and processes
-    with a revoked certificate, are left out.
+    The latter have other files, or only claim to run in an enclave; those with a revoked
+    certificate are left out, as is the observer.
     """
     own = [
         process
@@ -405,13 +405,12 @@ def _connecting_processes(running: RunningRobot) -> tuple[list[Process], list[Pr
         for _, group in group_by_authorities(
             process
             for process in running.in_domain
-            if process.enclave
-            and process.enclave.name != OBSERVER
-            and not process.is_daemon
-            and not running.revokes(process.enclave)  # others rightly refuse it
+            if process.enclave and process.enclave.name != OBSERVER and not process.is_daemon
         )
         for process in group
         if process.pid not in pids and any(member.pid in pids for member in group)
+        # Others rightly refuse a revoked certificate.
+        if process.enclave and not running.revokes(process.enclave)
     ]
     return own, others
 

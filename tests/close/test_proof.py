@@ -151,6 +151,8 @@ OF_OTHERS = 9
 """The id of a process that trusts the robot's CA, but may not belong to the robot."""
 FOREIGN = 10
 """The id of a process that trusts another CA."""
+STOLEN = 11
+"""The id of a process with other files; its certificate is revoked, as those of higher ids are."""
 
 
 @pytest.mark.parametrize(
@@ -192,6 +194,8 @@ FOREIGN = 10
             "sros cannot see whether process 9 (node9) in /node hears the others",
         ),
         (robot(1, 2, FOREIGN, deaf=[(1, FOREIGN)]), (), True, "2 processes of Fast DDS"),
+        (robot(1, 2, STOLEN, deaf=[(1, STOLEN)]), (), True, "2 processes of Fast DDS"),
+        (robot(12, 13, OF_OTHERS, deaf=[(12, OF_OTHERS)]), (), None, "process 9 (node9) may also"),
         ([replace(process, own_ports=frozenset()) for process in robot(1, 2)], (), None, None),
         (robot(1), (), None, None),
     ],
@@ -209,13 +213,18 @@ def test_processes_that_have_not_connected_fail_the_proof(
     proof neither hold nor fail.
     """
     in_domain = [
-        replace(process, enclave=ProcessEnclave("/export", "/node")) for process in processes
+        replace(process, enclave=ProcessEnclave(f"/export{process.pid}", "/node"))
+        for process in processes
     ]
     running: Any = SimpleNamespace(
         in_domain=in_domain,
-        secured=[(process, process.enclave) for process in in_domain if process.pid != FOREIGN],
+        secured=[
+            (process, process.enclave)
+            for process in in_domain
+            if process.pid not in (FOREIGN, STOLEN)
+        ],
         may_use_files=lambda process: process.pid not in (OF_OTHERS, FOREIGN),
-        revokes=lambda enclave: False,
+        revokes=[process.enclave for process in in_domain if process.pid >= STOLEN].__contains__,
     )
     monkeypatch.setattr(
         proof,
