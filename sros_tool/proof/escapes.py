@@ -1,7 +1,8 @@
 """What escapes the earlier requirements by a change.
 
 Nodes leave the enclaves that a requirement restricts, enclaves gain access by an exception for any
-package, a name loses its other side, or a robot moves to another namespace.
+package, a name loses its other side, its users get a new name, or a robot moves to another
+namespace.
 """
 
 from __future__ import annotations
@@ -18,10 +19,13 @@ from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave
 from sros_tool.policy.patterns import Names, common_name, covers, overlap
 from sros_tool.policy.rights import (
+    KIND_OF,
     NodeName,
     Right,
     RightsDifference,
     goal_right,
+    is_of_every_node,
+    join_actions,
     nodes_of,
     parts,
     rights_without_counterpart,
@@ -41,6 +45,7 @@ from sros_tool.proof.requirements import (
     NothingBut,
     Only,
     Requirement,
+    RightNames,
     Widest,
     dropped_requirements,
     enclaves_of,
@@ -396,6 +401,63 @@ def unanswered_requirement_findings(
             else:
                 text += "without which the requirement protects nothing"
             yield DROPPED.found(str(requirement), text, place.file, place.line, _GONE_REMEDY)
+
+
+def renamed_requirement_findings(
+    earlier: Sequence[Requirement],
+    requirements: Sequence[Requirement],
+    before: Collection[Right],
+    after: Collection[Right],
+) -> Iterator[Finding]:
+    """Yield a finding for each kept limit whose users HEAD probably gives a new name.
+
+    The requirement still protects the earlier name, which keeps its other side: for example, HEAD
+    renames a topic, and one subscriber keeps the earlier name.
+    """
+    first, second = join_actions(before), join_actions(after)
+    stated = {(right.right, right.name) for right in second if right.qualifier is ALLOW}
+
+    new_names: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for right in second - first:
+        if right.qualifier is ALLOW and not is_of_every_node(right.name):
+            new_names[right.enclave, right.right].add(right.name)
+    renamed: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for right in first - second:
+        is_gone = right.qualifier is ALLOW and (right.right, right.name) not in stated
+        if is_gone and (PEER_RIGHT[right.right], right.name) in stated:
+            renamed[right.right, right.name] |= new_names[right.enclave, right.right]
+    similar_requirements = similarity_to(earlier)
+    for requirement in requirements if any(renamed.values()) else ():
+        if not isinstance(requirement, Only | AtMost | NotBoth):
+            continue
+        lost = {
+            f"{right} {KIND_OF[right].removesuffix('s')} {name} (perhaps now {new})": None
+            for right, name in rights_that_need_a_peer(requirement)
+            for new in sorted(renamed.get((right, name), ()))
+            if dropped_requirements([_with_new_name(requirement, right, name, new)], requirements)
+        }
+        if lost and similar_requirements(requirement):
+            place = requirement.source
+            text = f"HEAD removes the last stated right to {first_few([*lost], 3)}, "
+            text += "and the requirement does not restrict the new name"
+            yield DROPPED.found(str(requirement), text, place.file, place.line, _GONE_REMEDY)
+
+
+def _with_new_name(
+    requirement: Only | AtMost | NotBoth, right: str, name: str, new: str
+) -> Requirement:
+    """Return the same requirement about the ``new`` name instead of ``name``."""
+
+    def renamed(rights: RightNames) -> RightNames:
+        return tuple(
+            (word, tuple(new if (word, of) == (right, name) else of for of in names))
+            for word, names in rights
+        )
+
+    if isinstance(requirement, NotBoth):
+        first, second = renamed(requirement.first), renamed(requirement.second)
+        return replace(requirement, first=first, second=second)
+    return replace(requirement, rights=renamed(requirement.rights))
 
 
 def _is_gained(right: Right, later: Collection[Right]) -> bool:

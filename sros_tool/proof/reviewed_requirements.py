@@ -30,6 +30,7 @@ from sros_tool.proof.escapes import (
     lost_restriction_findings,
     namespaces_in,
     namespaces_of_patterns,
+    renamed_requirement_findings,
     rights_with_new_peers,
     unanswered_requirement_findings,
 )
@@ -263,7 +264,10 @@ class ReviewedRequirements:
         moves = self._robot_moves()
         earlier, required = self._following(moves), self.head.requirements
         system, rights = self.subject.system, self.subject.rights
-        weakened = [*unanswered_requirement_findings(earlier, required, *rights)]
+        weakened = [
+            *unanswered_requirement_findings(earlier, required, *rights),
+            *renamed_requirement_findings(earlier, required, *rights),
+        ]
         sides = None
         with suppress(SrosError, OSError):  # the comparison reports the error
             sides = self.subject.policies()

@@ -26,8 +26,8 @@ from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import templates_dir
 from sros_tool.fleet.fleet_file import inventory, render_fleet
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.policy.model import ALLOW
-from sros_tool.policy.rights import Right, renamed_enclaves
+from sros_tool.policy.model import ALLOW, PEER_RIGHT
+from sros_tool.policy.rights import KIND_OF, Right, renamed_enclaves
 from sros_tool.proof import escapes, review, reviewed_requirements
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
@@ -1259,6 +1259,34 @@ def test_a_requirement_about_a_name_that_loses_its_other_side(
     assert "requirements-before" in ended.out or not lost, ended
     change.commit({"robot.xml": policy_text(panel | {"/moved/driver": before})})
     assert "HEAD removes" not in change.review(*words).out
+
+
+@pytest.mark.parametrize(
+    ("required", "right", "later", "fails"),
+    [
+        ('[[only]]\nrequest = ["/old"{}]\nenclaves = ["/a"]\n', "request", "/new", True),
+        ('[[only]]\npublish = ["old"{}]\nenclaves = ["//a*"]\n', "publish", "/new", True),
+        ('[[at_most]]\ncall = ["/old"{}]\nenclaves = 1\n', "call", "/new", True),
+        ('[[not_both]]\nfirst.call = ["/old"{}]\nsecond.call = ["/q"]\n', "call", "/new*", True),
+        # HEAD gives no new name, or only one that every node has.
+        ('[[at_most]]\npublish = ["/old"{}]\nenclaves = 1\n', "publish", "/rosout", False),
+    ],
+)
+def test_a_limit_whose_users_get_a_new_name(
+    change: Change, required: str, right: str, later: str, fails: bool
+) -> None:
+    """The earlier name keeps its other side. Twin: the limit is also about the new name."""
+    peer = PEER_RIGHT[right]
+    others = {"/b": may(peer, "/old", "/new"), "/c": may(right, "/q"), "/d": may(peer, "/q")}
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    before = policy_text({"/a": may(right, "/old"), **others})
+    change.base = change.commit({"robot.xml": before, "robot.toml": required.format("")})
+    change.commit({"robot.xml": policy_text({"/a": may(right, later), **others})})
+    ended = change.review(*asked)
+    lost = f"to {right} {KIND_OF[right][:-1]} /old (perhaps now {later}), and the requirement does"
+    assert (ended.status, lost in ended.out) == (fails, fails), ended
+    change.commit({"robot.toml": required.format(f', "{later}"')})
+    assert "HEAD removes" not in change.review(*asked).out
 
 
 def test_names_that_are_too_many_to_compare_leave_the_other_steps(
