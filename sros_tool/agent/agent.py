@@ -1116,10 +1116,13 @@ class _Round:
         """Return the enclaves' certificates and keys for TLS: those of the release come first.
 
         They are then sorted by expiry, the latest first. At most `_MOST_CERTIFICATES` are
-        returned. An enclave whose key does not belong to its certificate, or cannot be read, is
-        left out: `unusable_sentences` reports it.
+        returned, half of them for other enclaves if there are so many: the server may refuse all
+        of the release, or all others may be copied from another robot. An enclave whose key does
+        not belong to its certificate, or cannot be read, is left out: `unusable_sentences` reports
+        it.
         """
-        ranked: list[tuple[bool, datetime, ClientCertificate]] = []
+        of_release: list[tuple[datetime, ClientCertificate]] = []
+        others: list[tuple[datetime, ClientCertificate]] = []
         names = self._enclaves()
         own = self._own_enclaves(names)
         for name in names:
@@ -1129,9 +1132,12 @@ class _Round:
                 certificate = read_certificate(files.certificate)
                 key = load_key(read_bytes(files.key, "private key"), f"'{files.key}'")
                 if key.public_key() == certificate.public_key():
-                    ranked.append((name in own, validity_of(certificate).not_after, files))
-        ranked.sort(key=lambda certificate: certificate[:2], reverse=True)
-        return [files for *_, files in ranked[:_MOST_CERTIFICATES]]
+                    ranked = of_release if name in own else others
+                    ranked.append((validity_of(certificate).not_after, files))
+        for ranked in (of_release, others):
+            ranked.sort(key=lambda pair: pair[0], reverse=True)
+        kept = _MOST_CERTIFICATES - min(len(others), _MOST_CERTIFICATES // 2)
+        return [files for _, files in (*of_release[:kept], *others)][:_MOST_CERTIFICATES]
 
 
 def _enclaves_of(units: Iterable[Unit]) -> tuple[str, ...]:

@@ -349,7 +349,9 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     assert "lacks them: /r1/since, /r2/x. If they" in late, "for a day, if it had no certificate"
 
 
-def test_an_enclave_of_another_robot_that_is_newer_than_the_release(home: Home, r1: Robot) -> None:
+def test_an_enclave_of_another_robot_that_is_newer_than_the_release(
+    home: Home, r1: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It is no enclave to publish, signs no message, and identifies the robot last."""
     r1.settings = replace(r1.settings, source="https://home/pub")
     r1.round()
@@ -363,6 +365,9 @@ def test_an_enclave_of_another_robot_that_is_newer_than_the_release(home: Home, 
     assert "another robot: /q2/x. Release 1 lacks them, and their paths do not name r1." in problem
     assert "remove enclaves/q2/x here" in problem and not is_mended(problem)
     assert done.sent and r1.tried == [NAMES[0]]
+    monkeypatch.setattr("sros_tool.agent.agent._MOST_CERTIFICATES", 2)
+    r1.refused, r1.tried[:] = NAMES, []
+    assert r1.round().fetched and r1.tried == [NAMES[0], "/q2/x"], "not all are of the release"
     signed = smime.parse((r1.inbox / "r1/confirmation.p7s").read_bytes())
     signer = signed.signer()
     assert signer and pem(signer) != renewed
