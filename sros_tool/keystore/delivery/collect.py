@@ -272,13 +272,13 @@ def collect(
             root, forgotten, robots_with_lists, taken, now=now, keyring=keyring, dry_run=dry_run
         )
         notes = [*_later_release_notes(keystore, robots_with_seals), *notes]
+        after = OpenedKeystore(root)
         _defer_requests(
-            OpenedKeystore(root),
+            after,
             taken,
             is_restored=bool(signed),
             shows_later_releases=bool(forgotten.later_number),
         )
-        after = OpenedKeystore(root)
         is_older = bool(forgotten.later_number or restored_at(after))
         is_older |= may_have_later_releases(after)
         if not not_signed:

@@ -248,7 +248,7 @@ def publish(
     """
     check_tuf()
     keystore = OpenedKeystore(root)
-    fleet = recorded_fleet(keystore)
+    recorded_fleet(keystore)
     checked_fleet(keystore)
     refuse_archive_name(folder, "Releases are published in a folder: name one, such as pub.")
     _check_apart(root, folder)
