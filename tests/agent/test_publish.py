@@ -11,6 +11,7 @@ import re
 import shutil
 import stat
 import tarfile
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -50,7 +51,7 @@ from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import KnownKeys
-from sros_tool.keystore.layout import CRL, ca_key_path
+from sros_tool.keystore.layout import CRL, FLEET, ca_key_path
 from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
 from sros_tool.keystore.ledger import LATER_RELEASE, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
@@ -622,17 +623,44 @@ def test_two_at_once(publisher: Home, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_run_that_waited_for_another_sees_what_that_one_published(
     publisher: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    acquire = transaction.KeystoreLock.acquire
-
-    def first_publish_otherwise(lock: transaction.KeystoreLock) -> transaction.KeystoreLock:
-        monkeypatch.setattr(transaction.KeystoreLock, "acquire", acquire)
-        assert publisher.publish(after=timedelta()).names("published") == ["r1"]
-        return acquire(lock)
-
     publisher.run("renew", "ks", "--robot", "r1")
     publisher.now += LATER
-    monkeypatch.setattr(transaction.KeystoreLock, "acquire", first_publish_otherwise)
+
+    def publish_first() -> None:
+        assert publisher.publish(after=timedelta()).names("published") == ["r1"]
+
+    while_waiting(monkeypatch, "publishing folder", publish_first)
     assert publisher.publish(after=timedelta()).names("published") == []
+
+
+@pytest.mark.parametrize("place", ["publishing folder", "keystore"])
+def test_no_fleet_counts_that_was_edited_while_a_run_waited(
+    publisher: Home, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publisher.run("renew", "ks", "--robot", "r1")
+    before = archives(publisher)
+
+    def edit() -> None:
+        with (publisher.root / FLEET).open("a") as file:
+            file.write("[robots.r9]\n")
+
+    while_waiting(monkeypatch, place, edit)
+    with pytest.raises(KeystoreError, match=r"/fleet\.toml' "):
+        publisher.publish()
+    assert archives(publisher) == before
+
+
+def while_waiting(monkeypatch: pytest.MonkeyPatch, place: str, act: Callable[[], None]) -> None:
+    """Let ``act`` run once before the lock on ``place`` is acquired."""
+    acquire = transaction.KeystoreLock.acquire
+
+    def act_first(lock: transaction.KeystoreLock) -> transaction.KeystoreLock:
+        if lock._what == place:
+            monkeypatch.setattr(transaction.KeystoreLock, "acquire", acquire)
+            act()
+        return acquire(lock)
+
+    monkeypatch.setattr(transaction.KeystoreLock, "acquire", act_first)
 
 
 # ── keys and times ─────────────────────────────────────────────────────────────────────────

@@ -248,8 +248,7 @@ def publish(
     """
     check_tuf()
     keystore = OpenedKeystore(root)
-    recorded_fleet(keystore)
-    checked_fleet(keystore)
+    _unedited_fleet(keystore)
     refuse_archive_name(folder, "Releases are published in a folder: name one, such as pub.")
     _check_apart(root, folder)
     if behind := keystore.ledger_file.clock_clause(now):
@@ -274,7 +273,7 @@ def publish(
             stack.callback(lock.release)
             lock.acquire()
         keystore.forget()  # another run may have published while this one waited
-        fleet = recorded_fleet(keystore)
+        fleet = _unedited_fleet(keystore)
         run = _Publication(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
         run.notes += similar_names_notes(fleet)
         run.notes += left_enclaves_notes(keystore, fleet, left_enclaves(keystore, fleet, now))
@@ -306,6 +305,13 @@ def publish(
                     "Remove the cause, and publish again.",
                 ) from error
         return run.result(keys)
+
+
+def _unedited_fleet(keystore: OpenedKeystore) -> Fleet:
+    """Return the fleet of a keystore, which has to have one that nobody edited."""
+    fleet = recorded_fleet(keystore)
+    checked_fleet(keystore)
+    return fleet
 
 
 def _newer_folder_clause(keystore: OpenedKeystore) -> str:
@@ -1143,7 +1149,7 @@ class _Publication:
 
         If ``among`` is given, only these robots are examined.
         """
-        root, fleet = self.keystore.root, recorded_fleet(self.keystore)
+        root, fleet = self.keystore.root, _unedited_fleet(self.keystore)
         changed_robots, wanted = [], set()
         looked_at = (fleet.robots if among is None else {e.robot: e for e in among}).keys()
         for robot in looked_at:
