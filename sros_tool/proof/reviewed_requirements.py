@@ -19,7 +19,7 @@ from sros_tool.checks.requirements import ALLOWED_BY_NAME, HOLDS_ALONE, VACUOUS,
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.names import is_expression
-from sros_tool.policy.model import Policy, policy_in_namespace
+from sros_tool.policy.model import DENY, Policy, policy_in_namespace
 from sros_tool.policy.patterns import Names
 from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import Right, placed_rights
@@ -325,14 +325,17 @@ def _namespaces_to_try(
     for placed in chain.from_iterable(map(placed_rights, enclaves)):
         names = fixed if placed.written.startswith(("/", "*")) else moving
         names.add(placed.right.name)
-    changed = {right.name for right in before.rights ^ after.rights}
+    difference = before.rights ^ after.rights
+    changed = {right.name for right in difference}
     ordinary = "/any_namespace"
     while any(ordinary in right.name for right in (*before.rights, *after.rights)):
         ordinary += "_"
     relative = [requirement for requirement in requirements if requirement.is_relative]
     required = {name for requirement in relative for name in names_of(requirement)}
-    # A changed name that moves may break these only together with names that do not move.
+    # A changed name that moves may break these only together with names that do not move, and a
+    # removed DENY any requirement.
     are_joined = any(isinstance(requirement, AtMost | NotBoth) for requirement in relative)
+    are_joined |= any(right.qualifier is DENY for right in difference)
     by_changed_name = Names(sorted(fixed if are_joined and changed & moving else fixed & changed))
     names_in_order = sorted(fixed, key=lambda name: (name not in changed, name))
     ordered = [*dict.fromkeys(namespaces_in(names_in_order))]

@@ -2148,10 +2148,14 @@ _DENIED = publish("/left/*") + publish("x").replace("ALLOW", "DENY")
     ],
 )
 def test_names_that_do_not_move_break_requirements_together_with_names_that_do(
-    change: Change, requirement: str, before: str, after: str
+    change: Change, monkeypatch: pytest.MonkeyPatch, requirement: str, before: str, after: str
 ) -> None:
-    """In the namespace / and in most others, the change breaks nothing."""
-    text = {"/a": publish("x"), "/b": before, "/c": publish("y")}
+    """In the namespace / and in most others, the change breaks nothing.
+
+    Names of namespaces in which it breaks nothing do not use up those that are tried.
+    """
+    monkeypatch.setattr(reviewed_requirements, "MOST_NAMESPACES", 2)
+    text = {"/a": publish("x"), "/b": before, "/c": publish("y", "/b1/z", "/b2/z")}
     change.base = change.commit({"robot.xml": policy_text(text), "robot.toml": requirement})
     change.commit({"robot.xml": policy_text({**text, "/b": after})})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
