@@ -364,7 +364,7 @@ class KnownKeys:
         """Maps the digests of revoked keys to descriptions of the revoked certificates."""
         recorded = [entry for entry in self._keystore.entries_of("revocation") if entry.key]
         descriptions = {
-            entry.key: f"certificate {entry.serial} of {entry.subject}" for entry in recorded
+            entry.key: _description(entry.subject, int(entry.serial, 16)) for entry in recorded
         }
         serials = {entry.serial for entry in recorded}
         # If an earlier ledger was put back, only the lists have the later revocations.
@@ -372,7 +372,7 @@ class KnownKeys:
         if listed:
             for entry in self._keystore.ledger_file.with_values("serial", listed).entries:
                 if entry.what == "certificate" and entry.key and entry.serial in listed:
-                    text = f"certificate {entry.serial} of {entry.subject}"
+                    text = _description(entry.subject, int(entry.serial, 16))
                     descriptions.setdefault(entry.key, text)
         indexed = self._keystore.ledger_file.is_indexed
         known = serials if indexed else ()  # the ledger has these certificates
@@ -734,8 +734,12 @@ def keys_on_robots_remedy(root: Path, names: Sequence[str]) -> str:
 
 def _key_and_description(certificate: x509.Certificate) -> tuple[str, str]:
     """Return the digest of a certificate's key, and a description of the certificate."""
-    subject, serial = subject_text(certificate.subject), serial_text(certificate.serial_number)
-    return _key_digest_of(certificate), f"certificate {serial} of {subject}"
+    text = _description(subject_text(certificate.subject), certificate.serial_number)
+    return _key_digest_of(certificate), text
+
+
+def _description(subject: str, serial: int) -> str:
+    return f"certificate {serial_text(serial)} of {subject}"
 
 
 def _key_digest_of(certificate: x509.Certificate) -> str:

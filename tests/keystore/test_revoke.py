@@ -18,14 +18,17 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.export import distribute
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import LEDGER, enclave_path, list_enclaves
+from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
-from sros_tool.pki.certificates import validity_of
+from sros_tool.pki.certificates import key_digest, validity_of
 from sros_tool.pki.crl import REASONS, SUPERSEDED, RevocationList
+from sros_tool.pki.keys import generate_key
 from tests.support.children import run
 from tests.support.harness import (
     certificate,
@@ -175,6 +178,16 @@ def test_again_under_the_same_name(tmp_path: Path) -> None:
     revoke(root, ["/a"], now=NOW)
     assert len(crl_of(root).revoked) == 2
     assert len(list((root / "revoked").iterdir())) == 2
+
+
+def test_the_serial_number_of_a_revoked_key_is_printed_as_openssl_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keystore, key = OpenedKeystore(made(tmp_path / "keystore")), generate_key().public_key()
+    entry = Entry("", "revocation", subject="CN=/a", serial="abc", key=key_digest(key))
+    monkeypatch.setattr(OpenedKeystore, "entries_of", lambda *_: [entry])
+    with pytest.raises(KeystoreError, match="the key of certificate 0abc of CN=/a"):
+        KnownKeys(keystore).refuse_revoked_key(key, "it", "")
 
 
 @pytest.mark.parametrize("ledger", ["whole", "lost"])
