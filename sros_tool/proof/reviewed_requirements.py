@@ -319,14 +319,18 @@ def _namespaces_to_try(
     these names match.  Namespaces in which such a name of an added or removed right can match a
     requirement come first, then other namespaces of added and removed rights.
     """
-    enclaves = (*before.enclaves.values(), *after.enclaves.values())
-    fixed: set[str] = set()
-    moving: set[str] = set()
-    for placed in chain.from_iterable(map(placed_rights, enclaves)):
-        names = fixed if placed.written.startswith(("/", "*")) else moving
-        names.add(placed.right.name)
-    difference = before.rights ^ after.rights
+    placed, placed_after = (
+        {
+            (of.right, of.written.startswith(("/", "*")))
+            for of in chain.from_iterable(map(placed_rights, side.enclaves.values()))
+        }
+        for side in (before, after)
+    )
+    # Also a name that only becomes absolute or relative is another name in a namespace.
+    difference = {right for right, _ in placed ^ placed_after}
     changed = {right.name for right in difference}
+    fixed = {right.name for right, is_fixed in placed | placed_after if is_fixed}
+    moving = {right.name for right, is_fixed in placed | placed_after if not is_fixed}
     ordinary = "/any_namespace"
     while any(ordinary in right.name for right in (*before.rights, *after.rights)):
         ordinary += "_"

@@ -2140,6 +2140,8 @@ _DENIED = publish("/left/*") + publish("x").replace("ALLOW", "DENY")
     ("requirement", "before", "after"),
     [
         ('[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n', _DENIED, publish("/left/*")),
+        # In the namespace /, both are the same name.
+        (ONLY.replace("/x", "x"), publish("left/x"), publish("/left/x")),
         (
             '[[not_both]]\nfirst = {publish = ["x"]}\nsecond = {publish = ["y"]}\n',
             publish("/left/x"),
