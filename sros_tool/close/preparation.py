@@ -355,25 +355,37 @@ def _run_step(
 
 
 def _lost_protection(robot: LocalRobot) -> Iterator[str]:
-    """Yield a text for each requirement with a name that only the signed permissions have.
+    """Yield a text for each requirement with a name that the policy gave up.
 
     If the policy gave the name up for another one, the requirement does not protect the new name.
-    A new wildcard in place of the name, in the same enclaves, is no other name.
+    Then nobody names it any more, or nobody has the required right to it, and an enclave that had
+    it has a new right of this kind.  A new wildcard in place of the name, in the same enclaves, is
+    no other name.
     """
     if not robot.keystore.exists():
         return
     signed = load_rights(OpenedKeystore(robot.keystore)).rights
     stated = policy_rights(read_policy(robot.policy))
-    new_rules, kept = Rules(stated - signed), {right.name for right in stated}
-    gone = {right.name for right in signed if right.name not in kept and not new_rules.cover(right)}
+    new, kept = stated - signed, {right.name for right in stated}
+    given_up = {right for right in signed - stated if not Rules(new).cover(right)}
+    gone = {right.name for right in given_up if right.name not in kept}
+    held = {(right.right, right.name) for right in stated}
+    gaining = {(right.enclave, right.right) for right in new}
+    moved = {
+        (right.right, right.name)
+        for right in given_up
+        if (right.right, right.name) not in held and (right.enclave, right.right) in gaining
+    }
     for requirement in read_requirements(robot.requirements):
         if not isinstance(requirement, RightsRequirement):
             continue
-        required = {name for _, names in requirement.rights for name in names}
-        if lost := sorted(gone & required):
+        required = {(right, name) for right, names in requirement.rights for name in names}
+        names = gone & {name for _, name in required}
+        if lost := sorted(names | {name for _, name in moved & required}):
+            uses = "name" if names else "use as before"
             yield (
                 f"{robot.requirements}:{requirement.source.line} protects {enumerated(lost)}, "
-                f"which the policy does not name any more; {_NOT_SIGNED}. If the policy "
+                f"which the policy does not {uses} any more; {_NOT_SIGNED}. If the policy "
                 "renamed a name, also rename it in the requirement. If nobody needs a name any "
                 "more, remove it there (or accept this with --accept requirements)"
             )

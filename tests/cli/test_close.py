@@ -2181,12 +2181,14 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
         (publish("*"), "", False),  # a wildcard in place of the name
         (publish("y"), publish("*"), True),  # a wildcard that another enclave has
         (publish("y"), "", True),
+        (publish("y"), subscribe("x"), True),  # somebody still has the other side
     ):
         reads = subscribe("y") if lost else reader
         robot.policy.write_text(policy_text({"/a": groups, "/b": other, "/r": reads}))
         state_of_step, problems = preparation._run_step(robot, guard, accepted=set())
         assert state_of_step == ("findings" if lost else "done"), groups
-        said_now = "toml:1 protects /x, which the policy does not"
+        use = "use as before" if other == subscribe("x") else "name"
+        said_now = f"toml:1 protects /x, which the policy does not {use} any more; nothing was"
         assert [said_now in problem for problem in problems] == [True] * lost
     # A later name gets no requirement by itself, unlike those of the first policy.
     lost_policy = robot.policy.read_text()
