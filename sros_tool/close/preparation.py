@@ -566,7 +566,21 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
             f"{label} runs open, and has the name of {process.enclave}: stop it, and, if it is "
             f"this node, start it in its enclave: {start}. {silent.format('it')}"
         )
-    if unknown := [text for text in observed.unknown if text not in named]:
+    elsewhere = {
+        process_text(process): moved.enclave
+        for process in running.open_processes
+        for moved in observed.moved
+        if process_text(process) in observed.unknown and moved.fits(process)
+    }
+    for text, enclave in elsewhere.items():
+        yield (
+            f"{text.partition(': ')[0]} runs open, and has the command of {enclave}, which belongs "
+            f"to another machine: stop it, or bring the enclave back: {close} --here {enclave}. "
+            f"{silent.format('it')}"
+        )
+    if unknown := [
+        text for text in observed.unknown if text not in named.keys() | elsewhere.keys()
+    ]:
         them, runs = ("it", "it runs") if len(unknown) == 1 else ("them", "they run")
         advice = f"Watch again while {runs}: {close} --for 1m"
         if observed.elsewhere:

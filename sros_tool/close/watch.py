@@ -173,6 +173,12 @@ def _write_observation(robot: LocalRobot, document: str, observed: ObservedProce
     not_here = (robot.not_here - enclaves_here).union(robot.named_elsewhere)
     if robot.observed is None:  # otherwise checked before the watch
         robot.check_machines()
+    if returned := sorted(robot.not_here - not_here):
+        robot.named_here = [*robot.named_here, *returned]
+        robot.shell.say(
+            f"as with --here, this machine has {enumerated(returned)} again, because the watch saw "
+            "a process of it here"
+        )
     # A process that does not run now is still started by its remembered command.
     absent = robot.policy_enclaves() - enclaves_here - not_here
     kept = [process for process in robot.processes.processes if process.enclave in absent]

@@ -2404,6 +2404,12 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     commands = robot.folder / "robot/start/commands.txt"
     there = "\n# cd /opt && sros run FOLDER /listener -- /opt/run listener\n"
     assert there in commands.read_text()
+    robot.more = (replace(robot.process("/listener", is_secured=False), pid=19),)
+    back = "process 19 (run) runs open, and has the command of /listener, which belongs to another "
+    back += "machine: stop it, or bring the enclave back: sros close robot --here /listener. Otherw"
+    assert f"  {back}" in (said := robot.close(status=1).out)
+    assert "sros does not know" not in said
+    robot.more = ()
     required = robot.folder / "required.toml"
     widest = '[[widest]]\nenclaves = ["%s"]\npublish = ["/x"]\n'
     only = '[[only]]\npublish = ["/chatter"]\nenclaves = ["/talker", "/listener"]\n'
@@ -2434,6 +2440,12 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     robot.absent = set()
     ended = robot.close("--for", "1s", "--here", "/listener")
     assert "/listener: process 4712" in ended.out, ended
+    robot.absent = {"/listener"}
+    robot.close("--elsewhere", "/listener")
+    robot.absent = set()
+    returned = robot.close("--for", "1s").err
+    assert "as with --here, this machine has /listener again, because the watch saw" in returned
+    assert "still has the key of /listener: delete the files there" in returned
     robot.absent = {"/listener"}
     robot.close("--elsewhere", "/listener")
     assert not (robot.folder / left).exists()
