@@ -88,7 +88,7 @@ _ACCEPTANCES = {
     REQUIRED: Acceptance.REQUIREMENTS,
     CONNECTED: Acceptance.CONNECTIONS,
 }
-_ACCEPTS_REVOKED = f"a certificate was revoked ({CRL_FILE}), and is still accepted by"
+_ACCEPTS_REVOKED = f"{CRL_FILE} changed, so certificates that were revoked since are accepted by"
 
 
 class SecuredProcess(NamedTuple):
@@ -212,7 +212,10 @@ class RunningRobot:
         if names == [CRL_FILE]:
             return f"{warning}{_ACCEPTS_REVOKED}"
         or_mode = "" if newer.endswith(PLACE_OR_MODE) else ", or got another mode,"
-        return f"{warning}{newer} changed{or_mode} after the start of"
+        after = "after the start of"
+        if CRL_FILE in names:
+            after = "and certificates that were revoked since are accepted by"
+        return f"{warning}{newer} changed{or_mode} {after}"
 
     def not_observed(self) -> Sequence[str]:
         """Return the processes in enclaves that sros did not observe, as text.

@@ -403,6 +403,15 @@ def missing_enclave_error(
                 f"Start its process on that machine, or run `sros close {folder} --here "
                 f"{quote(name)}`.",
             )
+        with suppress(SrosError):
+            from sros_tool.policy.document import read_policy
+
+            if read_policy(robot / CLOSED_POLICY).enclave(name):
+                unsigned = f"{policy} has the enclave, but the change is not signed yet."
+                close = f"`sros close {folder}`"
+                return KeystoreError(
+                    missing, unsigned, f"Run {close}, which signs the change, or says why not."
+                )
         return KeystoreError(
             missing,
             why,

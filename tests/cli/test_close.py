@@ -1662,6 +1662,13 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     assert (
         "write the enclave's rights into robot/policy.xml, and run `sros close robot`." in lacking
     )
+    policy = robot.folder / "robot/policy.xml"
+    signed = policy.read_text()
+    (enclave,) = re.findall('(?s)<enclave path="/listener">.*?</enclave>', signed)
+    policy.write_text(signed.replace(enclave, enclave + enclave.replace("listener", "talker")))
+    unsigned = sros("distribute_key", "robot/keystore", "/talker", "x", cwd=robot.folder).err
+    assert "the change is not signed yet. Run `sros close robot`, which signs the" in unsigned
+    policy.write_text(signed)
     robot.nodes, robot.absent = (TALKER, LISTENER), set()
     said = robot.close("--for", "1s", status=1).out
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
@@ -1673,7 +1680,7 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     assert "not in the policy" not in said
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert "/talker -- /opt/run talker\n" in commands
-    robot.absent, policy = {"/talker"}, robot.folder / "robot/policy.xml"
+    robot.absent = {"/talker"}
     talker = r'(?s)<enclave path="/talker">.*?</enclave>'
     policy.write_text(re.sub(talker, "", policy.read_text()))
     assert "saw when it watched: /talker\n" in robot.close(status=1).out
