@@ -910,7 +910,7 @@ class _Review:
             yield "policies: none is named"
         if not asked.requirements:
             yield "requirements: none are named"
-        if self.is_relative and not asked.namespaces:
+        if self.is_relative:
             yield from self._undecided_in_namespaces()
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
@@ -955,6 +955,10 @@ class _Review:
 
     def _undecided_in_namespaces(self) -> Iterator[str]:
         """Yield a clause if requirements may fail in a namespace, though no change breaks them."""
+        subject = "requirements with relative names in namespaces other than"
+        if self.request.namespaces:
+            yield f"{subject} {enumerated(self.request.namespaces)}"
+            return
         options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
         if (
             not options
@@ -964,7 +968,7 @@ class _Review:
             return
         add = f" (add {' '.join(options[:MOST_NAMESPACES])})" if options else ""
         decided = self.decided_elsewhere and f": sros only decided {self.decided_elsewhere}"
-        yield f"requirements with relative names in namespaces other than /{add}{decided}"
+        yield f"{subject} /{add}{decided}"
 
     def _unreviewed_keystores(self, entries: Iterable[tuple[str, TreeEntry]]) -> list[str]:
         """Return keystores and exports with ``entries`` that are neither reviewed nor left out."""
