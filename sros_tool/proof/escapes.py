@@ -242,30 +242,38 @@ def access_by_name_findings(
             Right("", ALLOW, right, name) for right, names in requirement.rights for name in names
         )
         for step in steps:
+            enclave, patterns = step.use.enclave, patterns_of_any_package(whole[requirement])
+            if enclave in patterns and enclave in before.enclaves:
+                continue  # an earlier change named this enclave of the package
             is_new = any(
-                own.enclave == step.use.enclave
+                own.enclave == enclave
                 and own.right == right.right
                 and overlap(own.name, right.name)
-                and not _is_allowed(step.use.enclave, own, right.name, old)
+                and not _is_allowed(enclave, own, right.name, old)
                 for own in gained
                 for right in wanted
             )
-            if is_new and (whole[requirement], step.use.enclave) not in reported:
-                reported.add((whole[requirement], step.use.enclave))
+            if is_new and (whole[requirement], enclave) not in reported:
+                reported.add((whole[requirement], enclave))
                 text = step.text()
                 example = Right("", ALLOW, step.use.right, step.use.name)
-                if all(
-                    _is_allowed(step.use.enclave, of, of.name, old)
-                    for of in split_actions([example])
-                ):
+                if all(_is_allowed(enclave, of, of.name, old) for of in split_actions([example])):
                     ((word, (name,)),) = requirement.rights
-                    text = f"{step.use.enclave} may {word} more names that match {name}"
-                text += ": new access, which the requirement allows only by "
-                patterns = first_few(patterns_of_any_package(requirement), 3)
-                text += f"{patterns}, as to any enclave of such a name"
+                    text = f"{enclave} may {word} more names that match {name}"
+                remedy = "Approve this in the review."
+                if enclave in patterns:
+                    text += (
+                        f": this enclave is new, and the requirement allows /{enclave} whatever "
+                    )
+                    text += "package it belongs to"
+                else:
+                    matching = [name for name in patterns if covers(name, enclave)]
+                    written = [f"/{name}" if name[0] == "/" else name for name in matching]
+                    text += ": new access, which the requirement allows only by "
+                    text += f"{first_few(written, 3)}, which enclaves of any package can match"
+                    remedy += " No approval is needed if an earlier change already listed the "
+                    remedy += "enclave in the requirement by its own name."
                 place = step.source or similar_requirements(whole[requirement])[0].source
-                remedy = "Approve this in the review. No approval is needed if an earlier change "
-                remedy += "already listed the enclave in the requirement by its own name."
                 subject = str(whole[requirement])
                 yield DROPPED.found(subject, text, place.file, place.line, remedy)
 
