@@ -125,18 +125,22 @@ class Enclave:
         return replace(self, profiles=tuple(blocks))
 
 
-def policy_in_namespace(policy: Policy, namespace: str) -> Policy:
+def policy_in_namespace(
+    policy: Policy, namespace: str, unmoved: frozenset[str] = frozenset()
+) -> Policy:
     """Return a policy with its enclaves and nodes below a namespace, such as ``/left``.
 
-    Names that are written with a ``/`` at the beginning do not change.
+    Names that are written with a ``/`` at the beginning do not change.  An enclave in ``unmoved``
+    keeps its path, unless another enclave gets this path.
     """
-
+    paths = {enclave.path: below_namespace(enclave.path, namespace) for enclave in policy.enclaves}
+    paths |= {path: path for path in paths.keys() & unmoved.difference(paths.values())}
     enclaves = (
         replace(
             enclave.with_profiles(
                 lambda profile: replace(profile, ns=below_namespace(profile.ns, namespace))
             ),
-            path=below_namespace(enclave.path, namespace),
+            path=paths[enclave.path],
         )
         for enclave in policy.enclaves
     )

@@ -237,6 +237,20 @@ def enclaves_of(requirement: Requirement) -> tuple[str, ...]:
     return patterns_of_enclaves(requirement)
 
 
+def unmoved_enclaves(requirements: Iterable[Requirement]) -> frozenset[str]:
+    """Return the enclaves that requirements name with ``//``, without wildcards.
+
+    They do not move with the namespace.
+    """
+    return frozenset(
+        name
+        for requirement in requirements
+        if requirement.elsewhere
+        for name in (of.removeprefix(EXCEPT) for of in enclaves_of(requirement.elsewhere))
+        if name.startswith("/") and not is_expression(name)  # a name that moves is an expression
+    )
+
+
 def names_of(requirement: Requirement) -> tuple[str, ...]:
     """Return the names of topics, services and actions in a requirement."""
     match requirement:

@@ -45,6 +45,7 @@ from sros_tool.proof.requirements import (
     names_of,
     read_all_requirements,
     renamed_names,
+    unmoved_enclaves,
 )
 from sros_tool.proof.sources import AccessSource
 from sros_tool.proof.system import System
@@ -221,11 +222,16 @@ class ReviewedRequirements:
 
         A requirement fails if it is broken, or if no right is left for any name in it.  It does not
         fail because of the change if BASE has the same failure under names that the change renames.
+
+        Enclaves that the requirement names with ``//`` do not move with the namespace.  If other
+        requirements name further enclaves in this way, the requirement has to hold both if these
+        move and if they do not: a name in another requirement cannot hide a failure.
         """
         package = self._package() if self.is_relative else None
         if not package:
             return
         tried = self._namespaces.ordered[:MOST_NAMESPACES]
+        all_unmoved = unmoved_enclaves(self.head.requirements)
         failing = {violation.requirement for violation in self.decided.violations}
         failing |= {requirement for requirement, _ in self.decided.vacuous}
         # In the namespaces of its own patterns, a requirement is for other enclaves than in /.
@@ -237,21 +243,30 @@ class ReviewedRequirements:
         for name in dict.fromkeys([*tried, *chain(*left.values())]):
             namespace = self._in_namespace(name, *package)
             for at in [at for at in left if name in left[at]]:
-                for finding in namespace.findings(namespace.required[at]):
+                own = unmoved_enclaves([self.head.requirements[at]])
+                ways = (
+                    [*namespace.findings(namespace.required[at], unmoved)]
+                    for unmoved in dict.fromkeys((own, all_unmoved))
+                )
+                for finding in next(filter(None, ways), ()):
                     left.pop(at, None)
                     place = f"in namespace {name}, which the review tries"
                     yield finding._replace(text=f"{place}: {finding.text}")
 
     def _in_namespace(self, name: str, base: AccessSource, head: AccessSource) -> _Namespace:
-        def system(source: AccessSource) -> System:
-            moved = policy_in_namespace(source.policy, name)
-            return replace(self.system_of(moved), is_package=True)
+        def systems(source: AccessSource) -> Callable[[frozenset[str]], System]:
+            @cache
+            def system(unmoved: frozenset[str]) -> System:
+                moved = policy_in_namespace(source.policy, name, unmoved)
+                return replace(self.system_of(moved), is_package=True)
+
+            return system
 
         earlier, required = (
             read_all_requirements(side.files.values(), namespaces=(name,), remaps=self.remaps)
             for side in (self.base, self.head)
         )
-        return _Namespace(earlier, required, cache(partial(system, base)), system(head))
+        return _Namespace(earlier, required, systems(base), systems(head))
 
     # ── dropped by HEAD ────────────────────────────────────────────────────────────────────
 
@@ -414,35 +429,47 @@ def _failures(decided: Decisions, findings: Sequence[Finding]) -> dict[_Failure,
 
 @dataclass(frozen=True)
 class _Namespace:
-    """The requirements and worlds of BASE and HEAD in another namespace."""
+    """The requirements and worlds of BASE and HEAD in another namespace.
+
+    ``before`` and ``after`` return the worlds, in which the given enclaves do not move.
+    """
 
     earlier: Sequence[Requirement]
     required: Sequence[Requirement]
-    before: Callable[[], System]
-    after: System
+    before: Callable[[frozenset[str]], System]
+    after: Callable[[frozenset[str]], System]
 
-    def findings(self, requirement: Requirement) -> Iterator[Finding]:
+    def findings(self, requirement: Requirement, unmoved: frozenset[str]) -> Iterator[Finding]:
         """Yield the findings on a requirement that are new in HEAD."""
-        broken = self._failures_after(requirement)
+        broken = self._failures_after(requirement, unmoved)
         if not broken:
             return
-        known = {*self._failures_before(requirement), *self._dropped_failures(requirement)}
+        known = {
+            *self._failures_before(requirement, unmoved),
+            *self._dropped_failures(requirement, unmoved),
+        }
         if known.issuperset(broken):
             return
         if breaking := frozenset[str]().union(*(failure.enclaves for failure in known)):
-            broken = self._failures_after(requirement, breaking)
+            broken = self._failures_after(requirement, unmoved, breaking)
         yield from (finding for failure, finding in broken.items() if failure not in known)
 
     @cached_property
     def _dropped(self) -> Sequence[DroppedRequirement]:
         return dropped_requirements(self.earlier, self.required)
 
-    def _failures_before(self, requirement: Requirement) -> dict[_Failure, Finding]:
-        decided = decide_all([requirement], self.before())
-        return _failures(decided, decided_findings(decided, self.before()))
+    def _failures_before(
+        self, requirement: Requirement, unmoved: frozenset[str]
+    ) -> dict[_Failure, Finding]:
+        before = self.before(unmoved)
+        decided = decide_all([requirement], before)
+        return _failures(decided, decided_findings(decided, before))
 
     def _failures_after(
-        self, requirement: Requirement, breaking: frozenset[str] = frozenset()
+        self,
+        requirement: Requirement,
+        unmoved: frozenset[str],
+        breaking: frozenset[str] = frozenset(),
     ) -> dict[_Failure, Finding]:
         """Return the failures of a requirement in HEAD.
 
@@ -450,16 +477,19 @@ class _Namespace:
         the requirements of BASE forbid it already.  The place of a finding is a right of an enclave
         that is not in ``breaking``, if such an enclave breaks the requirement.
         """
-        decided = decide_all([requirement], self.after, breaking)
-        rights = self.before().rights if decided.unnamed else ()
-        return _failures(decided, decided_findings(decided, self.after, rights, self.earlier))
+        after = self.after(unmoved)
+        decided = decide_all([requirement], after, breaking)
+        rights = self.before(unmoved).rights if decided.unnamed else ()
+        return _failures(decided, decided_findings(decided, after, rights, self.earlier))
 
-    def _dropped_failures(self, requirement: Requirement) -> Iterator[_Failure]:
+    def _dropped_failures(
+        self, requirement: Requirement, unmoved: frozenset[str]
+    ) -> Iterator[_Failure]:
         """Yield the failures in BASE of dropped requirements that have other names than this one.
 
         The requirements are otherwise the same.  The failures have the names of ``requirement``.
         """
         for dropped in self._dropped:
             if names := renamed_names(dropped.requirement, requirement):
-                failures = self._failures_before(dropped.requirement)
+                failures = self._failures_before(dropped.requirement, unmoved)
                 yield from (failure.with_new_names(names) for failure in failures)

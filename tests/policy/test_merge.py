@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from shlex import split
 
@@ -85,6 +86,27 @@ def test_a_policy_in_a_namespace(namespace: str, path: str, relative: str) -> No
     assert [enclave.path for enclave in moved.enclaves] == [path]
     names = {right.name for right in policy_rights(moved)}
     assert names == {relative, f"{relative[:-1]}n/y", "/z"}
+
+
+@pytest.mark.parametrize(
+    ("unmoved", "paths"),
+    [
+        ("/b", ["/left/a", "/b"]),
+        ("/left/a", ["/left/a", "/left/b"]),
+        ("/c", ["/left/a", "/left/b"]),
+    ],
+)
+def test_enclaves_that_stay_where_they_are(unmoved: str, paths: list[str]) -> None:
+    both = Policy(tuple(replace(one().enclaves[0], path=path) for path in ("/a", "/b")))
+    moved = policy_in_namespace(both, "/left", frozenset([unmoved]))
+    assert [enclave.path for enclave in moved.enclaves] == paths
+
+
+def test_no_two_enclaves_get_one_path() -> None:
+    """One of them would hide the rights of the other one."""
+    both = Policy(tuple(replace(one().enclaves[0], path=path) for path in ("/a", "/left/a")))
+    moved = policy_in_namespace(both, "/left", frozenset(["/left/a"]))
+    assert [enclave.path for enclave in moved.enclaves] == ["/left/a", "/left/left/a"]
 
 
 @pytest.mark.parametrize(

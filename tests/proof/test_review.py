@@ -1366,6 +1366,7 @@ _NOTHING_BUT = (
     'subscribe = ["/clock"]\nreply = ["*"]\n'
 )
 _ONLY_OPERATORS = '[[only]]\npublish = ["/cmd"]\nenclaves = ["/drive", "*/operator/*"]\n'
+_ONLY_HAND = '[[only]]\npublish = ["cmd"]\nenclaves = ["/drive", "//operator/hand"]\n'
 _ADDED = "# added\n"
 _REPLACED = "# replaced by\n"
 _NODES = {
@@ -1479,6 +1480,22 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
                 _NODES | {"/operator/hand": publish("/cmd")},
                 "/operator/hand may publish /cmd: new access",
             ),
+            (
+                _HANDS,
+                _ONLY_OPERATORS.replace("*/", "//").replace('"/cmd', '"cmd'),
+                _HANDS | {"/operator/hand": publish("/x", "/cmd")},
+                "/operator/hand may publish /cmd: new access, which the requirement allows only by "
+                "//operator/*, which enclaves",
+            ),
+            (
+                _NODES,
+                _ONLY_HAND,
+                _NODES | {"/operator/hand": publish("/cmd")},
+                "/operator/hand may publish /cmd: this enclave is new, and the requirement allows "
+                "//operator/hand whatever package",
+            ),
+            # An earlier change named this enclave, which the package has.
+            (_HANDS, _ONLY_HAND, _HANDS | {"/operator/hand": publish("/x", "/cmd")}, ""),
             # The exception is for the robot's own operators, or the enclave gains other access.
             (
                 _NODES,
@@ -1554,7 +1571,7 @@ def test_a_change_escapes_no_requirement(
     change.commit({"robot.xml": policy_text(after), "robot.toml": required})
     ended = change.review(*words)
     assert said in ended.out, ended
-    found = ("where the requirement does not apply", "which the requirement allows only by")
+    found = ("where the requirement does not apply", "the requirement allows ")
     assert any(text in ended.out for text in found) == bool(said), ended
     failed = "[FAILED] requirements-before"
     assert (failed in ended.out) == bool(said) <= ended.status, ended
@@ -1863,6 +1880,9 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
     assert ended.status == 1 and "only decided" not in ended.out, ended
+    assert "not covered: requirements with relative names in namespaces other than /l and /" in (
+        ended.out
+    )
     assert "requirements robot.xml: 1 error, 1 note in /l and /" in ended.out, ended
     assert "/b: may publish /l/x, but only /l/a may publish /l/x" in ended.out
     ended = change.review(*asked, "--namespace", "/l", "--remap", "x:=/x")
@@ -1942,7 +1962,7 @@ def test_a_wildcard_that_gives_users_in_a_namespace_no_more_breaks_nothing(
     change: Change, required: str, is_new: bool
 ) -> None:
     """Users in a namespace have this failure already. Twin: the requirement has more names."""
-    only = f'[[only]]\npublish = ["{required}"]\nenclaves = ["//a"]\n'
+    only = f'[[only]]\npublish = ["{required}"]\nenclaves = ["//[a]"]\n'
     text = policy_text({"/a": publish("x"), "/b": subscribe("x")})
     change.base = change.commit({"robot.xml": text, "robot.toml": only})
     change.commit({"robot.xml": text.replace(">x<", ">x*<", 1)})
@@ -2131,6 +2151,50 @@ def test_a_requirement_for_other_enclaves_in_the_namespaces_of_its_patterns(
     ended = change.review(*asked)
     assert ended.status == 1, ended
     assert "/arm/op: in namespace /arm, which the review tries" in ended.out, ended
+
+
+_HAND = '[[only]]\npublish = ["x"]\nenclaves = ["/a", "//op/hand"]\n'
+_ONLY_Y = '[[only]]\npublish = ["y"]\nenclaves = ["/a"]\n'
+_MUST_HAND = '[[must]]\npublish = ["x"]\nenclave = "//op/hand"\n'
+
+
+@pytest.mark.parametrize(
+    ("added", "before", "after", "said"),
+    [
+        ({"/op/hand": ["x"]}, _HAND, _HAND, ""),
+        ({"/op/hand": ["/left/x"]}, _HAND, _HAND, ""),
+        ({"/op/hand": ["x"]}, _HAND, _HAND + _MUST_HAND, ""),
+        ({"/op/hand": ["/left/y"]}, _HAND + _ONLY_Y, _HAND + _ONLY_Y, "/hand: in namespace /left,"),
+        # Requirements that name the enclave in different ways.
+        (
+            {"/op/hand": ["y"]},
+            _HAND + _ONLY_Y.replace('"/a"', '"/a", "/op/hand"'),
+            _HAND + _ONLY_Y.replace('"/a"', '"/a", "/op/hand"'),
+            "error: /op/hand: in namespace /any_namespace, ",
+        ),
+        # The change names an enclave so that it does not move.
+        (
+            {"/b": ["/left/y"]},
+            _ONLY_Y,
+            _ONLY_Y + _HAND.replace("//op/hand", "//b"),
+            "/left/b: in n",
+        ),
+        ({"/b": []}, _HAND, _HAND.replace('"/a"', '"/a", "//a"'), "requirement.dropped"),
+        ({"/b": []}, _HAND, _HAND.replace('"/a"', '"//a"'), "requirement.dropped"),
+    ],
+)
+def test_an_enclave_that_does_not_move_with_the_namespace(
+    change: Change, added: dict[str, list[str]], before: str, after: str, said: str
+) -> None:
+    """Users merge it with `--enclave`."""
+    enclaves = dict.fromkeys(("/op/hand", "/b"), publish("v"))
+    enclaves |= {"/a": publish("x", "y"), "/c": subscribe("v", "x", "y", "z")}
+    change.base = change.commit({"robot.xml": policy_text(enclaves), "robot.toml": before})
+    enclaves |= {path: publish("v", *names) for path, names in added.items()}
+    change.commit({"robot.xml": policy_text(enclaves), "robot.toml": after})
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    ended = change.review(*asked)
+    assert (ended.status, said in ended.out) == (bool(said), True), ended
 
 
 _DENIED = publish("/left/*") + publish("x").replace("ALLOW", "DENY")
