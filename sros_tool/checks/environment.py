@@ -20,6 +20,7 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import ROS_DISTRO
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import Fault
+from sros_tool.graph.observation import PROFILE_VARIABLES
 from sros_tool.keystore.fleet import stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
@@ -487,7 +488,6 @@ _PROFILE_SECURITY = rb"dds\.sec\.|&#"
 """The properties that secure a participant of Fast DDS, or an escape that may hide them."""
 _NAMES_PROFILES = rb"_PROFILES_FILE|\\u"
 """Variables that name profiles, as text in a file of variables, or an escape that may hide them."""
-PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _DEFAULT_PROFILES = ("DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml")
 """The files that Fast DDS reads from its working directory (Fast DDS 2.14, ``XMLProfileManager``).
 Security properties in a default profile apply to every participant of rmw_fastrtps.

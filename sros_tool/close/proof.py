@@ -20,7 +20,7 @@ from sros_tool.checks.connections import (
     not_connected_text,
     process_name,
 )
-from sros_tool.checks.environment import PROFILE_VARIABLES, is_zenoh
+from sros_tool.checks.environment import is_zenoh
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.checks.processes import (
@@ -52,7 +52,7 @@ from sros_tool.close.state import (
 )
 from sros_tool.close.talk import UnitRestarts, proof_of_talk
 from sros_tool.errors import SrosError, UnavailableError
-from sros_tool.graph.observation import Observation
+from sros_tool.graph.observation import PROFILE_VARIABLES, Observation
 from sros_tool.keystore.expiry import renewal_command, survey
 from sros_tool.keystore.layout import KEY_FILES, enclave_path, list_enclaves
 from sros_tool.keystore.reader import OpenedKeystore

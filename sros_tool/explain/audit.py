@@ -340,8 +340,8 @@ class AuditResult(NamedTuple):
     """The nodes of tools, such as `ros2 topic echo`, which were not judged."""
     observation: Observation
     settled: bool
-    """Whether the whole ROS graph was seen: it stopped changing, or was watched without a gap and
-    did not grow any more at the end.
+    """Whether the ROS graph stopped changing, or was watched without a gap and did not grow any
+    more at the end.
     """
     partial: bool
     """Whether ``--partial`` accepted nodes that were not seen."""

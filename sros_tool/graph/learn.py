@@ -834,8 +834,8 @@ class LearnedPolicy(NamedTuple):
     intermittent: Sequence[IntermittentEndpoint]
     """The endpoints that running nodes had only for a part of the watch (`--watch`)."""
     settled: bool
-    """Whether the whole ROS graph was seen: it stopped changing, or was watched without a gap and
-    did not grow any more at the end. Always true for a log.
+    """Whether the ROS graph stopped changing, or was watched without a gap and did not grow any
+    more at the end. Always true for a log.
     """
     added: Sequence[Right]
     """The rights that are added to the policy."""

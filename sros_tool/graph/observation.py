@@ -53,6 +53,8 @@ class IntermittentEndpoint(NamedTuple):
 
 FAST_DDS = "010f"
 """The first two bytes of a participant of Fast DDS: its vendor id (RTPS 2.3, 9.4.5.1)."""
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+"""Variables that name files of profiles, for Fast DDS 2 and for Fast DDS 3."""
 
 
 @shows("enclaves", "namespace", "name", "participant", "publish", "subscribe")

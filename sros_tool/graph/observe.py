@@ -28,10 +28,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
 
 from sros_tool.errors import UnavailableError
 from sros_tool.graph.observation import (
+    PROFILE_VARIABLES,
     SUBSCRIBE,
     Endpoint,
     IntermittentEndpoint,
@@ -45,6 +47,8 @@ from sros_tool.pki.certificates import IDENTITY_DIGITS
 _LOG = logging.getLogger(__name__)
 _NO_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Variables against shared memory: Fast DDS cannot write to another user's shared memory."""
+_ANNOUNCING = Path(__file__).with_name("fast_dds_observer.xml")
+"""The profile of the observer's participant: it announces itself to new processes in time."""
 _READING_SECONDS = 0.1
 """Seconds between two readings of the graph; short, to see a node that runs for a second."""
 _START_SECONDS = 30.0
@@ -110,7 +114,10 @@ class RosGraph:
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        self._environment = {**_NO_SHARED_MEMORY, **os.environ, **(environment or {})}
+        variables = {**os.environ, **(environment or {})}
+        if not any(variables.get(name) for name in PROFILE_VARIABLES):
+            variables |= dict.fromkeys(PROFILE_VARIABLES, str(_ANNOUNCING))
+        self._environment = {**_NO_SHARED_MEMORY, **variables}
         on_zenoh = self._environment.get("RMW_IMPLEMENTATION") == "rmw_zenoh_cpp"
         self._module = f"sros_tool.graph.{'zenoh_tokens' if on_zenoh else 'observation'}"
         _require("zenoh" if on_zenoh else "rclpy")

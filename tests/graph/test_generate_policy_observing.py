@@ -8,10 +8,13 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from lxml import etree
 
 from sros_tool.cli import observing
 from sros_tool.close.proof import _seen_by_listener
+from sros_tool.graph import observe
 from sros_tool.graph.observation import (
+    PROFILE_VARIABLES,
     IntermittentEndpoint,
     intermittent_from_json,
     make_observation,
@@ -42,6 +45,8 @@ TWINS = (
     ("/two", "/", "twin", "02", ["publish rt/y"]),
 )
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
+ANNOUNCING = Path(observe.__file__).with_name("fast_dds_observer.xml")
+GIVEN_PROFILES = tuple(zip(PROFILE_VARIABLES, ("my.xml", f"${PROFILE_VARIABLES[0]}"), strict=True))
 SHORT = ("robot.xml", "--spin-time", "0.6")
 
 
@@ -230,12 +235,30 @@ def test_a_failure_is_one_paragraph(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("chosen", "used"), [({}, "UDPv4"), ({TRANSPORTS: "SHM"}, "SHM")])
-def test_an_observer_needs_no_memory_of_other_users(
-    program: Program, chosen: dict[str, str], used: str
+@pytest.mark.parametrize(
+    ("shown", "chosen", "used"),
+    [
+        (TRANSPORTS, {}, "UDPv4"),
+        (TRANSPORTS, {TRANSPORTS: "SHM"}, "SHM"),
+        *((name, {}, str(ANNOUNCING)) for name in PROFILE_VARIABLES),
+        *((PROFILE_VARIABLES[0], {name: "my.xml"}, given) for name, given in GIVEN_PROFILES),
+    ],
+)
+def test_the_variables_of_an_observer_on_fast_dds(
+    program: Program, shown: str, chosen: dict[str, str], used: str
 ) -> None:
-    """Fast DDS cannot write to it, and the nodes of a user would have no names for root."""
-    assert f"with {used}." in program(graph(rmw=f"${TRANSPORTS}"), *SHORT, **chosen).err
+    """It cannot write to other users' memory, and must announce itself to nodes that soon end.
+
+    A profile of the user, such as one that names a discovery server, stays.
+    """
+    assert f"with {used}." in program(graph(rmw=f"${shown}"), *SHORT, **chosen).err
+
+
+def test_an_observer_announces_itself_to_nodes_that_soon_end() -> None:
+    (participant,) = etree.parse(ANNOUNCING).getroot()
+    assert participant.get("is_default_profile") == "true"
+    (period,) = participant.iterfind(".//{*}leaseAnnouncement")
+    assert [part.text for part in period] == ["0", "100000000"]
 
 
 def test_a_watch_tells_what_is_new(program: Program) -> None:
