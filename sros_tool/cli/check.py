@@ -334,21 +334,25 @@ def check(
         from sros_tool.distributions import ROS_DISTRO, sourced_distribution
         from sros_tool.proof.upgrade import check_upgrade
 
-        path = _one_path(family, paths, "--upgrade-to")
         with progress("comparing"):
-            changed = check_upgrade(
-                path,
-                upgrade_to,
-                at,
-                present=distro,
-                here=sourced_distribution(os.environ.get(ROS_DISTRO)),
-                vendor=vendor or "",
-            )
-        chosen = selection.choose(map(_with_relative_paths, changed.findings))
-        not_compared = changed.enclaves - changed.compared
+            updates = [
+                check_upgrade(
+                    path,
+                    upgrade_to,
+                    at,
+                    present=distro,
+                    here=sourced_distribution(os.environ.get(ROS_DISTRO)),
+                    vendor=vendor or "",
+                )
+                for path in _policies_or_keystore(family, paths, "--upgrade-to")
+            ]
+        changes = dict.fromkeys(finding for update in updates for finding in update.findings)
+        chosen = selection.choose(map(_with_relative_paths, changes))
+        compared = sum(update.compared for update in updates)
+        not_compared = sum(update.enclaves for update in updates) - compared
         are = counted(not_compared, "enclave is", "enclaves are")
         upgraded = f"; {are} already for {upgrade_to.title}" if not_compared else ""
-        echo(f"compared {counted(changed.compared, 'enclave')}{upgraded}", err=True)
+        echo(f"compared {counted(compared, 'enclave')}{upgraded}", err=True)
         _PRINTERS[form](chosen, selection)
         return _status(chosen, fail_on)
     if suggest:
@@ -474,16 +478,17 @@ def _is_option_given(parameter: str) -> bool:
     return source is ParameterSource.COMMANDLINE
 
 
-def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
-    """Return the only path, which has to be a policy file or a keystore."""
+def _policies_or_keystore(family: str, paths: tuple[Path, ...], option: str) -> list[Path]:
+    """Return the only path, which has to be a keystore or a policy, or the policies in it."""
     from sros_tool.keystore.layout import is_keystore
+    from sros_tool.policy.document import files_of_policies
 
     if family != "runtime" and len(paths) < 2:
         path = paths[0] if paths else keystore_from_environment()
-        if not path.is_dir() or is_keystore(path):
-            return path
+        if found := [path] if is_keystore(path) else list(files_of_policies(path)):
+            return found
     raise UsageError(
-        f"{option} takes one policy file or keystore",
+        f"{option} takes one policy file, folder of policies or keystore",
         "",
         "Name only one, and run the command once for each.",
     )

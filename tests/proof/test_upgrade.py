@@ -412,6 +412,22 @@ def test_an_update_that_cannot_be_compared(words: tuple[str, ...], why: str, ben
     assert re.match(r"compared [1-9]\d* enclaves\n", compared.err)
 
 
+def test_all_policies_of_a_folder_are_compared(tmp_path: Path) -> None:
+    folder = tmp_path / "policies"
+    (folder / "arm").mkdir(parents=True)
+    words = ("check", folder, "--distro", "jazzy", "--upgrade-to", "lyrical")
+    assert "takes one policy file, folder of policies or keystore" in sros(*words).err
+    rights = '<topics subscribe="ALLOW"><topic>*</topic></topics>'
+    rights += '<topics publish="DENY"><topic>x</topic></topics>'
+    for file in (folder / "base.xml", folder / "arm/hand.xml"):
+        file.write_text(policy_text({f"/{file.stem}": rights}))
+    update = sros(*words, "--json")
+    assert "compared 2 enclaves\n" in update.err
+    found = [(each["id"], each["subject"]) for each in json.loads(update.out)["findings"]]
+    assert found.count(("upgrade.vulnerabilities", "Cyclone DDS 0.10.5 to 11.0.1")) == 1
+    assert {subject for kind, subject in found if kind == "upgrade.opens"} == {"/base", "/hand"}
+
+
 def test_an_empty_keystore_says_how_many_enclaves_were_compared(tmp_path: Path) -> None:
     sros("create_keystore", tmp_path / "ks").ok()
     words = ("check", tmp_path / "ks", "--distro", "jazzy", "--upgrade-to", "kilted")
