@@ -251,6 +251,21 @@ def unmoved_enclaves(requirements: Iterable[Requirement]) -> frozenset[str]:
     )
 
 
+def enclaves_allowed_unmoved(requirement: Requirement) -> frozenset[str]:
+    """Return the `unmoved_enclaves` that an `Only` allows by these names alone.
+
+    So a change that adds such a name to the list weakens the requirement.
+    """
+    if not isinstance(requirement.elsewhere, Only):
+        return frozenset()
+    allowed = {name for name in requirement.elsewhere.enclaves if not name.startswith(EXCEPT)}
+    return frozenset(
+        name
+        for name in allowed & unmoved_enclaves([requirement])
+        if not any(covers(pattern, name) for pattern in allowed - {name})
+    )
+
+
 def names_of(requirement: Requirement) -> tuple[str, ...]:
     """Return the names of topics, services and actions in a requirement."""
     match requirement:

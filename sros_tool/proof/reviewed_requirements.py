@@ -42,6 +42,7 @@ from sros_tool.proof.requirements import (
     Requirement,
     dropped_findings,
     dropped_requirements,
+    enclaves_allowed_unmoved,
     names_of,
     read_all_requirements,
     renamed_names,
@@ -223,9 +224,9 @@ class ReviewedRequirements:
         A requirement fails if it is broken, or if no right is left for any name in it.  It does not
         fail because of the change if BASE has the same failure under names that the change renames.
 
-        Enclaves that the requirement names with ``//`` do not move with the namespace.  If other
-        requirements name further enclaves in this way, the requirement has to hold both if these
-        move and if they do not: a name in another requirement cannot hide a failure.
+        Enclaves that the requirement allows by a name with ``//`` do not move with the namespace.
+        If other lists name further enclaves with ``//``, the requirement has to hold both if these
+        move and if they do not: no name that the change adds elsewhere hides a failure.
         """
         package = self._package() if self.is_relative else None
         if not package:
@@ -243,7 +244,7 @@ class ReviewedRequirements:
         for name in dict.fromkeys([*tried, *chain(*left.values())]):
             namespace = self._in_namespace(name, *package)
             for at in [at for at in left if name in left[at]]:
-                own = unmoved_enclaves([self.head.requirements[at]])
+                own = enclaves_allowed_unmoved(self.head.requirements[at])
                 ways = (
                     [*namespace.findings(namespace.required[at], unmoved)]
                     for unmoved in dict.fromkeys((own, all_unmoved))
