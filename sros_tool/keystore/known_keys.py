@@ -728,7 +728,8 @@ def keys_on_robots_remedy(root: Path, names: Sequence[str]) -> str:
         "release that it can fetch. Then take the request.pem of each of these enclaves from the "
         f"robot, sign it with `sros sign_request {where} REQUEST --no-answer --renew`, and run "
         f"`sros renew {where} {enclaves} --revoke-old`. If the key of a request was revoked, first "
-        "make a new key on the robot (docs/howto/rotate.md, A key in wrong hands)."
+        "make a new key on the robot (docs/howto/rotate.md, A key in wrong hands). Do none of this "
+        "for robots that were stolen or removed: revoke them."
     )
 
 

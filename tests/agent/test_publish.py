@@ -1740,6 +1740,7 @@ def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(
     earlier = [command.replace("REQUEST", str(files[0])).split() for command in commands]
     newest = key_digest(load_request(second, "it").public_key)
     assert "agent run" in mend and f" is {newest}" in sros(*earlier[0], cwd=publisher.folder).err
+    assert "Do none of this for robots that were stolen or removed: revoke them." in mend
     another = f"the keystore has another key of enclave {name} than its robot"
     assert another in sros(*earlier[1], cwd=publisher.folder).err
     for command in commands:
