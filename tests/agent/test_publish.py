@@ -1698,6 +1698,42 @@ def test_a_restored_keystore_replaces_no_key_that_a_robot_made(
     assert not any(map(known.is_revoked, keys)) and all(map(known.is_revoked, made))
 
 
+def test_a_restored_keystore_makes_no_keys_for_a_robot_that_a_lost_ca_certified(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The ledger never records the certificates of this robot: only releases show its enclave."""
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
+    root, policy = publisher.root, ("-p", "policy.xml", "--fleet", "fleet.toml")
+    rotate = ("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    generate = ("generate_artifacts", "-k", "ks", *policy)
+    (publisher.folder / "policy.xml").write_text(policy_text({"/{robot}/arm": allow_publish("x")}))
+    publisher.run(*generate)
+    publisher.publish()
+    backup = copy_of(root, publisher.folder / "backup")
+    publisher.run(*rotate)
+    fleet = publisher.folder / "fleet.toml"
+    fleet.write_text(f"{fleet.read_text()}[robots.r9]\n")
+    request = create_request(publisher.folder / "r9", "/r9/arm").file
+    sign = ("sign_request", "ks", request, "--no-answer", *policy)
+    publisher.run(*sign)
+    publisher.run(*generate)
+    publisher.run("renew", "ks", "/r1/base", "--new-key", "--revoke-old")
+    publisher.publish()
+    shutil.rmtree(root)
+    backup.rename(root)
+    publisher.now += LATER
+    publisher.run(*rotate)
+    for restore in ((), ("fleet", "publish", "ks", "pub", "--restored")):
+        if restore:
+            assert sros(*restore, cwd=publisher.folder).status == 2
+        refused = sros(*generate, cwd=publisher.folder)
+        assert (refused.status, (root / "enclaves/r9").exists()) == (2, False), refused
+        assert "would create /r9/arm" in refused.err or "lacks /r9/arm, which got" in refused.err
+    publisher.run(*sign)
+    publisher.run(*generate)
+    assert [*root.glob("enclaves/r9/*/*.pem")] and not [*root.glob("enclaves/r9/*/key.pem")]
+
+
 def test_a_restored_keystore_makes_no_other_key_for_a_router(publisher: Home) -> None:
     """No policy names its enclave."""
     root, fleet = publisher.root, publisher.folder / "fleet.toml"

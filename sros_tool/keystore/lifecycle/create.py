@@ -27,7 +27,11 @@ from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageE
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
-from sros_tool.keystore.delivery.published import may_have_later_releases, read_published
+from sros_tool.keystore.delivery.published import (
+    enclaves_in_later_releases,
+    may_have_later_releases,
+    read_published,
+)
 from sros_tool.keystore.delivery.restored import (
     has_unpublished_restore,
     restores_after_last_release,
@@ -492,7 +496,8 @@ def _refuse_before_restored(keystore: OpenedKeystore, missing: Sequence[str], co
     """
     restores = restores_after_last_release(keystore)
     has_later_releases = may_have_later_releases(keystore)
-    if PUBLISHING in restores if has_later_releases else not restores:
+    is_settled = PUBLISHING in restores if has_later_releases else not restores
+    if is_settled:
         return
     policy_clause = (
         f"The policy would create {first_few(missing, 3)} with new keys, but a robot may have made "
@@ -531,11 +536,16 @@ def _names_with_keys_made_on_robots(change: KeystoreChange, names: Sequence[str]
 def _enclaves_certified_after_backup(
     change: KeystoreChange, missing: Sequence[str]
 ) -> frozenset[str]:
-    """Return the enclaves in ``missing`` that got a valid certificate after the last backup."""
+    """Return the enclaves in ``missing`` that got a valid certificate after the last backup.
+
+    The ledger does not record certificates of a CA that the keystore has lost: until the keystore
+    publishes again, only the later releases show their enclaves.
+    """
     if not missing or not restored_at(change.keystore):
         return frozenset()
     shown = change.known.certificates_shown_after_restore(missing)
-    return frozenset(entry.enclave for entry in shown if entry.not_after > iso(change.now))
+    certified = frozenset(entry.enclave for entry in shown if entry.not_after > iso(change.now))
+    return certified | enclaves_in_later_releases(change.keystore).intersection(missing)
 
 
 def refuse_other_template(root: Path, template: Template) -> None:
