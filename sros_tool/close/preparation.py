@@ -367,7 +367,8 @@ def _lost_protection(robot: LocalRobot) -> Iterator[str]:
     signed = load_rights(OpenedKeystore(robot.keystore)).rights
     stated = policy_rights(read_policy(robot.policy))
     new, kept = stated - signed, {right.name for right in stated}
-    given_up = {right for right in signed - stated if not Rules(new).cover(right)}
+    new_rules = Rules(new)
+    given_up = {right for right in signed - stated if not new_rules.cover(right)}
     gone = {right.name for right in given_up if right.name not in kept}
     held = {(right.right, right.name) for right in stated}
     gaining = {(right.enclave, right.right) for right in new}
@@ -570,7 +571,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         process_text(process): moved.enclave
         for process in running.open_processes
         for moved in observed.moved
-        if process_text(process) in observed.unknown and moved.fits(process)
+        if process_text(process) in {*observed.unknown}.difference(named) and moved.fits(process)
     }
     for text, enclave in elsewhere.items():
         yield (
