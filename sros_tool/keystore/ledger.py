@@ -92,6 +92,8 @@ PERHAPS_REVOKED = "perhaps revoked"
 
 Publishing waits until the enclave is revoked, or has a key that the ledger records after this line.
 """
+ON_ROBOT_ONLY = "on robot only"
+"""The ``reason`` of a restore, on a line with an enclave of a release that the keystore lacks."""
 RENEWED_BY_NAME = "renewed by name"
 """The ``reason`` of permissions that `sros renew` signed for a named enclave after a restore."""
 NEW_CA = "new CA"

@@ -1058,8 +1058,9 @@ def test_a_robot_that_left_the_fleet_does_not_come_back_with_a_restored_keystore
     backup.rename(publisher.root)
     with pytest.raises(KeystoreError, match="later releases of r1 than the keystore"):
         publisher.publish()
-    with pytest.raises(KeystoreError, match="again without r5, and"):
+    with pytest.raises(KeystoreError, match="/r5/base may have been revoked or removed"):
         publisher.publish(restored=True)
+    publisher.run("revoke", "ks", "/r5/base")
     publisher.run(*change)
     assert publisher.publish(restored=True).names("published") == ["r1", "r2"]
 
@@ -1723,15 +1724,50 @@ def test_a_restored_keystore_makes_no_keys_for_a_robot_that_a_lost_ca_certified(
     backup.rename(root)
     publisher.now += LATER
     publisher.run(*rotate)
-    for restore in ((), ("fleet", "publish", "ks", "pub", "--restored")):
-        if restore:
-            assert sros(*restore, cwd=publisher.folder).status == 2
+    restore = ("fleet", "publish", "ks", "pub", "--restored")
+    new_key = ("renew", "ks", "/r1/base", "--new-key", "--revoke-old")
+    for command, status in (((), 0), (restore, 2), (new_key, 0), (restore, 0)):
+        if command:
+            assert sros(*command, cwd=publisher.folder).status == status
         refused = sros(*generate, cwd=publisher.folder)
         assert (refused.status, (root / "enclaves/r9").exists()) == (2, False), refused
         assert "would create /r9/arm" in refused.err or "lacks /r9/arm, which got" in refused.err
     publisher.run(*sign)
     publisher.run(*generate)
     assert [*root.glob("enclaves/r9/*/*.pem")] and not [*root.glob("enclaves/r9/*/key.pem")]
+
+
+def test_a_restored_keystore_names_a_stolen_robot_only_to_be_revoked(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The later identity CA, which alone lists the theft, is lost with the keystore."""
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
+    root, fleet = publisher.root, publisher.folder / "fleet.toml"
+    rotate = ("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    backup, with_all = copy_of(root, publisher.folder / "backup"), fleet.read_text()
+    publisher.run("renew", "ks", "--all", "--new-key", "--revoke-old")
+    publisher.run(*rotate)
+    publisher.publish()  # which leaves an archive of r2
+    publisher.run("revoke", "ks", "--robot", "r2")
+    fleet.write_text(with_all.replace("[robots.r2]\n", ""))
+    publisher.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    publisher.publish()
+    shutil.rmtree(root)
+    backup.rename(root)
+    publisher.now += LATER
+    publisher.run(*rotate)
+    refused = sros("fleet", "publish", "ks", "pub", "--restored", cwd=publisher.folder)
+    assert refused.status == 2
+    commands = re.findall(r"`(sros (?:renew|revoke) ks .*?)`", refused.err)
+    assert [command for command in commands if "/r2/base" in command] == [
+        "sros revoke ks /r2/base",
+        "sros renew ks /r2/base --new-key --revoke-old",
+    ], refused
+    publisher.run(*commands[-2].split()[1:])
+    fleet.write_text(with_all.replace("[robots.r2]\n", ""))
+    publisher.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    publisher.run(*commands[0].split()[1:])
+    assert publisher.publish(restored=True).names("published") == ["r1", "r5"]
 
 
 def test_a_restored_keystore_makes_no_other_key_for_a_router(publisher: Home) -> None:

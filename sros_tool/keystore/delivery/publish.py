@@ -62,6 +62,7 @@ from sros_tool.keystore.delivery.restored import (
     LaterChange,
     RobotClaim,
     check_authorities,
+    enclaves_of_removed_robots,
     has_unpublished_restore,
     later_changes,
     older_than_robots_error,
@@ -967,7 +968,9 @@ class _Publication:
         changes = without_agreed_changes(
             self.keystore, later_changes(self.keystore, last, self._now)
         )
-        perhaps_revoked = perhaps_revoked_enclaves(self.keystore, last, [*self._sealed_releases()])
+        removed = enclaves_of_removed_robots(self.keystore, last, self._present_releases)
+        sealed = [*self._sealed_releases()]
+        perhaps_revoked = removed | perhaps_revoked_enclaves(self.keystore, last, sealed)
         unknown = forgotten_lists.unknown_certificates(self.keystore).values()
         unknowing = KnownKeys(self.keystore).made_unknowing(self.keystore.names, unknown)
         others = {*unknowing.values()} - {e.enclave for e in changes if e.change == "key"}
@@ -981,6 +984,7 @@ class _Publication:
             shown_by=PUBLISHING,
             enclaves_with_named_rights=() if lost else rights,
             perhaps_revoked=perhaps_revoked,
+            on_robots_only=[change.enclave for change in changes if change.change == "missing"],
             now=self._now,
             keyring=keyring,
             dry_run=self._dry_run,
@@ -997,15 +1001,19 @@ class _Publication:
             if self._revoked:
                 names = first_few(sorted(self._revoked), _MOST_NAMES)
                 self._restored_texts.append(f"it has revoked {names} again")
+        # Enclaves of removed robots are named only as perhaps revoked, so that no command certifies
+        # the keys of a stolen robot again.
         changes = [
             LaterChange("key" if is_key else "certificate", name, "")
             for name, is_key in revocation.replaced.items()
+            if name not in removed
         ] + [
             change
             for change in changes
             if change.enclave not in self._revoked
             and not (
-                change.change in ("key", "other_key") and change.enclave in revocation.replaced
+                change.change in ("key", "other_key")
+                and change.enclave in revocation.replaced.keys() | removed
             )
         ]
         named = {change.enclave for change in changes if change.change in ("key", "other_key")}

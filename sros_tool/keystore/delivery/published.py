@@ -255,19 +255,6 @@ def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
     return frozenset(serials)
 
 
-def enclaves_in_later_releases(keystore: OpenedKeystore) -> frozenset[str]:
-    """Return the enclaves of the archives in the publishing folder, if it has later releases.
-
-    Raises:
-        KeystoreError: as `releases_in`.
-    """
-    if not may_have_later_releases(keystore):
-        return frozenset()
-    published = read_published(keystore)
-    releases = releases_in(Path(published.folder), len(published.robots))
-    return frozenset(name for release in releases for name in release.enclaves())
-
-
 def releases_in(folder: Path, robots: int, altered: set[str] | None = None) -> Iterator[Release]:
     """Yield the releases in all archives of a publishing folder, whichever CA sealed them.
 

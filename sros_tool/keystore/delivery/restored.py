@@ -308,6 +308,31 @@ def later_changes(
     return [change for change in changes if change.enclave not in revoked]
 
 
+def enclaves_of_removed_robots(
+    keystore: OpenedKeystore, last: Mapping[str, Release | None], published: Collection[str]
+) -> set[str]:
+    """Return the keystore's enclaves of robots that later releases show as revoked or removed.
+
+    These are robots without a release, and robots that are not among the ``published`` ones, whose
+    releases the present metadata has (empty without metadata).  ``last`` is as in `later_changes`.
+    """
+    if not _shows_later_changes(keystore, last):
+        return set()
+    fleet = recorded_fleet(keystore)
+    return {
+        name
+        for robot, member in fleet.robots.items()
+        if robot not in last or (published and robot not in published)
+        for name in enclaves_of_robot(keystore, fleet, member)
+    }
+
+
+def _shows_later_changes(keystore: OpenedKeystore, last: Mapping[str, Release | None]) -> bool:
+    """Return whether the keystore does not know the latest of the releases that can be read."""
+    latest = max((release.number for release in last.values() if release), default=None)
+    return latest is not None and latest not in keystore.known_releases
+
+
 def perhaps_revoked_enclaves(
     keystore: OpenedKeystore, last: Mapping[str, Release | None], earlier: Sequence[Release]
 ) -> set[str]:
@@ -316,17 +341,17 @@ def perhaps_revoked_enclaves(
     ``last`` is as in `later_changes`; ``earlier`` are other sealed releases.  The seals prove what
     is in a release, so this also finds what an identity CA revoked that the keystore has lost:
 
-    - A release that the keystore does not know lacks the enclave, or its robot has no release.
+    - A release that the keystore does not know lacks the enclave.
     - A revocation list in a release has a certificate for the enclave's key, and no last release
       has a valid certificate for this key.
     - The last release of the robot lacks revocations of the latest release, or cannot be read, and
       neither the ledger nor a release shows the certificates that were revoked.
     """
+    if not _shows_later_changes(keystore, last):
+        return set()
     known = keystore.known_releases
     readable = [release for release in last.values() if release]
-    latest = max(readable, key=lambda release: release.number, default=None)
-    if latest is None or latest.number in known:
-        return set()
+    latest = max(readable, key=lambda release: release.number)
     revoked = _revoked_serials_in([*readable, *earlier])
     shown = {
         certificate.serial_number: (name, _key_of(certificate))
@@ -344,7 +369,7 @@ def perhaps_revoked_enclaves(
     for robot, member in fleet.robots.items():
         own, release = enclaves_of_robot(keystore, fleet, member), last.get(robot)
         listed = _revoked_serials_in([release]) if release else {}
-        if robot not in last or unexplained - listed.keys():
+        if unexplained - listed.keys():
             found |= {*own}
         elif release and release.number not in known:
             found |= {*own} - release.enclaves().keys()
@@ -653,7 +678,10 @@ def _few_changes(keystore: OpenedKeystore, lines: Sequence[tuple[str, str]], lab
 def perhaps_revoked_step(keystore: OpenedKeystore, names: Sequence[str]) -> str:
     """Return what to do about enclaves that may have been revoked after the backup."""
     root, enclaves = quote(str(keystore.root)), " ".join(map(quote, names))
-    steps = f"Revoke those that should not run any more: `sros revoke {root} {enclaves}`."
+    steps = (
+        f"Revoke those that should not run any more: `sros revoke {root} {enclaves}`. Robots that "
+        "lose all their enclaves also have to leave the fleet file."
+    )
     if here := [name for name in names if not key_on_robot(keystore.folder(name))]:
         renew = f"sros renew {root} {' '.join(map(quote, here))} --new-key --revoke-old"
         steps += f" Give new keys to the others: `{renew}`."

@@ -27,11 +27,7 @@ from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageE
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
-from sros_tool.keystore.delivery.published import (
-    enclaves_in_later_releases,
-    may_have_later_releases,
-    read_published,
-)
+from sros_tool.keystore.delivery.published import may_have_later_releases, read_published
 from sros_tool.keystore.delivery.restored import (
     has_unpublished_restore,
     restores_after_last_release,
@@ -87,7 +83,14 @@ from sros_tool.keystore.layout import (
     remedy_in_closed_robot,
     similar_keystores,
 )
-from sros_tool.keystore.ledger import PUBLISHING, RESTORED, Entry, certificate_entry, document_entry
+from sros_tool.keystore.ledger import (
+    ON_ROBOT_ONLY,
+    PUBLISHING,
+    RESTORED,
+    Entry,
+    certificate_entry,
+    document_entry,
+)
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
@@ -538,14 +541,17 @@ def _enclaves_certified_after_backup(
 ) -> frozenset[str]:
     """Return the enclaves in ``missing`` that got a valid certificate after the last backup.
 
-    The ledger does not record certificates of a CA that the keystore has lost: until the keystore
-    publishes again, only the later releases show their enclaves.
+    The ledger does not record certificates of a CA that the keystore has lost, only their enclaves.
     """
-    if not missing or not restored_at(change.keystore):
+    if not missing:
         return frozenset()
-    shown = change.known.certificates_shown_after_restore(missing)
-    certified = frozenset(entry.enclave for entry in shown if entry.not_after > iso(change.now))
-    return certified | enclaves_in_later_releases(change.keystore).intersection(missing)
+    marks = change.keystore.entries_of(RESTORED)
+    on_robots = {mark.enclave for mark in marks if mark.reason == ON_ROBOT_ONLY}
+    certified = on_robots.intersection(missing)
+    if restored_at(change.keystore):
+        shown = change.known.certificates_shown_after_restore(missing)
+        certified |= {entry.enclave for entry in shown if entry.not_after > iso(change.now)}
+    return frozenset(certified)
 
 
 def refuse_other_template(root: Path, template: Template) -> None:

@@ -28,7 +28,13 @@ from sros_tool.keystore.layout import (
     has_key,
     key_on_robot,
 )
-from sros_tool.keystore.ledger import PERHAPS_REVOKED, RESTORED, Entry, certificate_entry
+from sros_tool.keystore.ledger import (
+    ON_ROBOT_ONLY,
+    PERHAPS_REVOKED,
+    RESTORED,
+    Entry,
+    certificate_entry,
+)
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.reader import OpenedKeystore
@@ -177,6 +183,7 @@ def restore_revocations(
     shown_by: str = "",
     enclaves_with_named_rights: Collection[str] = (),
     perhaps_revoked: Collection[str] = (),
+    on_robots_only: Collection[str] = (),
     **options: Unpack[ChangeOptions],
 ) -> RestoredRevocations:
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
@@ -196,7 +203,8 @@ def restore_revocations(
     Its ``reason`` is ``shown_by``.  Further entries have ``enclaves_with_named_rights``: the caller
     names the rights that these enclaves lost after the backup, so that a later renewal counts as
     consent to these rights.  These further entries are left out while there are certificates to
-    replace first.  Each of the enclaves ``perhaps_revoked`` that stays has an entry, too.
+    replace first.  Each of the enclaves ``perhaps_revoked`` that stays has an entry, too, and each
+    of ``on_robots_only``, enclaves that the keystore lacks: robots may have made their keys.
 
     Raises:
         KeystoreError: as `revoke`.
@@ -280,6 +288,10 @@ def restore_revocations(
             *(
                 mark._replace(enclave=name, reason=PERHAPS_REVOKED)
                 for name in sorted({*perhaps_revoked} - gone)
+            ),
+            *(
+                mark._replace(enclave=name, reason=ON_ROBOT_ONLY)
+                for name in sorted({*on_robots_only})
             ),
         ]
         change.entries = [*(marks if shows_restore else ()), *unknown.values()]
