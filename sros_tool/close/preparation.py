@@ -555,7 +555,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     """Yield texts on processes without known nodes, and on nodes without a known process."""
     robot, observed = running.robot, state.observed
     close = robot.close_command
-    silent = "Otherwise, nobody would hear {} any more (--accept nodes accepts this)"
+    silent = "While {} open, the closed robot does not hear {} (--accept nodes accepts this)"
     policy = robot.read_policy() if state.secured else None
     nodes, stopped = policy.nodes() if policy else {}, state.stopped
     idle = {enclave: names for enclave, names in nodes.items() if enclave in stopped}
@@ -565,7 +565,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         label, start = text.partition(": ")[0], process.secured_command(robot.folder.absolute())
         yield (
             f"{label} runs open, and has the name of {process.enclave}: stop it, and, if it is "
-            f"this node, start it in its enclave: {start}. {silent.format('it')}"
+            f"this node, start it in its enclave: {start}. {silent.format('it runs', 'it')}"
         )
     elsewhere = {
         process_text(process): moved.enclave
@@ -577,7 +577,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         yield (
             f"{text.partition(': ')[0]} runs open, and has the command of {enclave}, which belongs "
             f"to another machine: stop it, or bring the enclave back: {close} --here {enclave}. "
-            f"{silent.format('it')}"
+            f"{silent.format('it runs', 'it')}"
         )
     if unknown := [
         text for text in observed.unknown if text not in named.keys() | elsewhere.keys()
@@ -600,7 +600,10 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         what = "the enclave of" if state.secured else "a node of"
         number = counted(len(unknown), "open process", "open processes")
         processes = first_few(unknown, MOST_NAMES)
-        yield f"sros does not know {what} {number}: {processes}. {advice}. {silent.format(them)}"
+        yield (
+            f"sros does not know {what} {number}: {processes}. {advice}. "
+            f"{silent.format(runs, them)}"
+        )
     routers = [process for process in running.open_processes if process.is_router]
     if routers and not any(process.is_router for process in observed.processes):
         yield (
@@ -625,7 +628,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
             f"another machine: {close} {options}. If you do not know one of the nodes, it may be "
             f"a stranger's: remove its enclave from '{robot.policy}', and remove "
             f"'{robot.requirements}', which sros then proposes again. "
-            f"{silent.format('them')}"
+            f"{silent.format('they run', 'them')}"
         )
 
 

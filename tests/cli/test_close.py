@@ -1565,7 +1565,7 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
         in robot.close(status=1).out
     )
     assert (
-        "nobody would hear it any more (--accept nodes accepts this)"
+        "While it runs open, the closed robot does not hear it (--accept nodes accepts this)"
         in robot.close("--apply", status=1).out
     )
     assert robot.restarts == []

@@ -84,6 +84,8 @@ from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words, shows
 from sros_tool.wording import counted, first_few
 
+_MOST_NAMED = 3
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SignedRequests(Changed):
@@ -374,6 +376,8 @@ class _RequestCertifier:
         self._writer = change.writer()
         self._certified: dict[str, Enclave | None] = {}
         self._new: list[str] = []
+        self._earlier: dict[str, x509.Certificate] = {}
+        """Maps enclaves that get a new key to their certificates for the old key."""
 
     def _record_paths(self) -> None:
         """Add the policy's paths with placeholders to the fleet of the keystore.
@@ -427,8 +431,10 @@ class _RequestCertifier:
                 raise self._revoked_error(name)
             _refuse_earlier_key(request, known)
         if present:
-            note = _new_key_note(root, present, request, change.now)
-            change.notes += note or [*known.shared_key_notes([name])]
+            if present.public_key() == request.public_key:
+                change.notes += known.shared_key_notes([name])
+            else:
+                self._earlier[name] = present
         else:
             self._new.append(name)
             change.notes += known.revoked_before_notes([name])
@@ -514,6 +520,7 @@ class _RequestCertifier:
         """Stage the Zenoh configurations that follow from all certified requests."""
         change = self._change
         change.notes += [
+            *_new_key_notes(self._root, self._earlier, change.now),
             *self._writer.notes,
             *change.known.missing_key_notes(),
             *change.edit_notes(),
@@ -682,22 +689,24 @@ def _check_answer_usable(answer: RequestAnswer, request: SigningRequest, now: da
         ) from error
 
 
-def _new_key_note(
-    root: Path, old: x509.Certificate, request: SigningRequest, now: datetime
-) -> list[Note]:
-    """Return a note if the request's key is not the key of the current certificate ``old``."""
-    if old.public_key() == request.public_key:
-        return []
-    until = validity_of(old).not_after
-    if until <= now:
-        rest = f"The certificate of the old key expired at {iso(until)}."
-    else:
+def _new_key_notes(
+    root: Path, earlier: Mapping[str, x509.Certificate], now: datetime
+) -> Iterator[Note]:
+    """Yield a note on the certificates for the old keys of enclaves that get new keys."""
+    if not earlier:
+        return
+    ends = {name: validity_of(certificate).not_after for name, certificate in earlier.items()}
+    valid = [name for name in earlier if ends[name] > now]
+    old = "the old key" if len(ends) == 1 else "each old key"
+    rest = f"The certificate of {old} has expired."
+    if valid:
+        names = " ".join(map(quote, valid)) if len(valid) <= _MOST_NAMED else "ENCLAVE..."
+        until = iso(max(ends.values())) + " at the latest" * (len({*ends.values()}) > 1)
         rest = (
-            f"The certificate of the old key stays valid until {iso(until)} for anyone who has "
-            f"that key. To revoke it: `sros renew {quote(str(root))} {quote(request.name)} "
-            "--revoke-old`."
+            f"The certificate of {old} stays valid until {until} for anyone who has that key. To "
+            f"revoke it: `sros renew {quote(str(root))} {names} --revoke-old`."
         )
-    return [Note("request.new-key", f"{request.name}: the request has a new key. {rest}")]
+    yield Note("request.new-key", f"{first_few([*ends], _MOST_NAMED)}: requested a new key. {rest}")
 
 
 def _lost_rights_notes(
