@@ -511,7 +511,9 @@ def _refuse_folders_of_others(folder: Path, files: Iterable[str]) -> None:
 
 
 def write_units(folder: Path, files: Mapping[str, str], changes: Mapping[str, str]) -> None:
-    """Write the files that `unit_changes` returned."""
+    """Write the files that `unit_changes` returned; without files, do not touch the folder."""
+    if not changes:
+        return
     new = {path: files[path].encode() for path, action in changes.items() if action == "create"}
     if not folder.exists():
         write_new_folder(folder, new)

@@ -1356,6 +1356,17 @@ def test_a_watch_that_is_interrupted_keeps_nodes_and_processes_of_one_time(
     assert [file.read_bytes() for file in files] == before
 
 
+@pytest.mark.parametrize("folder", ["/proc", "/proc/none"])
+def test_applying_without_units_writes_nothing_for_systemd(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    """Not even root can write into these folders."""
+    for module in (apply, processes, start_files, state):
+        monkeypatch.setattr(module, "SYSTEMD_FOLDER", Path(folder))
+    robot.close()
+    assert "start again with:" in robot.close("--apply", status=1).out
+
+
 @pytest.mark.parametrize("function", some(["write_units", "_restart_units"], 1))
 def test_applying_that_is_interrupted_goes_on_or_back(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, function: str
