@@ -1425,6 +1425,27 @@ def test_keystore_and_folder_that_were_lost(publisher: Home) -> None:
         shutil.rmtree(publisher.pub)
 
 
+def test_keystore_and_folder_from_one_backup(publisher: Home) -> None:
+    """Robots have seen later versions of metadata that the restored releases do not change."""
+    fleet, places = publisher.folder / "fleet.toml", (publisher.root, publisher.pub)
+    generate = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    with_all, backups = fleet.read_text(), list[Path]()
+    for text in ("[robots.r1]\n", with_all):  # without r2 and r5, one list of robots is empty
+        backups = [
+            copy_of(place, publisher.folder / f"{len(text)}{place.name}") for place in places
+        ]
+        fleet.write_text(text)
+        publisher.run(*generate)
+        publisher.publish()
+    robot = publisher.robot()
+    robot.gets()
+    for place, backup in zip(places, backups, strict=True):
+        shutil.rmtree(place)
+        backup.rename(place)
+    publisher.publish(restored=True, new_folder=True)
+    robot.gets()
+
+
 @pytest.mark.parametrize("at", ["metadata", "targets", "targets/robots", "metadata/timestamp.json"])
 def test_links_and_pipes_in_a_publishing_folder_lead_nowhere(publisher: Home, at: str) -> None:
     place, kept = publisher.pub / at, publisher.folder / "kept"

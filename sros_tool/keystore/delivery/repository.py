@@ -408,7 +408,8 @@ class MetadataComposer:
             present: the metadata in the publishing folder.
             signers: the signers of each role, the current one first.
             known: the versions that were published before, as far as the keystore knows.
-            least: a number that new versions must exceed.
+            least: a number that all versions must exceed, because robots may have seen higher
+                versions than the keystore knows.
             expiry: how long new metadata is valid.
             now: the current time.
         """
@@ -466,11 +467,12 @@ class MetadataComposer:
     def _is_current(self, name: str, metadata: Metadata[_Content]) -> bool:
         """Return whether metadata is the last version of ``name``, with half of its validity left.
 
+        Versions up to ``least`` are too low.
         The last version can be in another folder, if the keystore published there since.
         """
         signed = metadata.signed
         lasts = signed.expires - self._now > self._expiry.lifetime(signed.type) / 2
-        return lasts and signed.version == self.versions[name]
+        return lasts and self._least < signed.version == self.versions[name]
 
     def _can_be_kept(self, metadata: Metadata[_Content]) -> bool:
         """Return whether top-level metadata can stay: it is current, and each signer signed it."""
@@ -498,7 +500,11 @@ class MetadataComposer:
     def _add_snapshot(self) -> None:
         """Add the snapshot if it changes, and always a new timestamp."""
         parts = sorted(self.versions.keys() - {_TIMESTAMP, _SNAPSHOT})
-        # Names of unused bins stay, because robots refuse a snapshot in which a name is missing.
+        # Names of unused bins stay, because robots refuse a snapshot in which a name is missing, or
+        # has a lower version.
+        for name in parts:
+            if self._least and name not in self._expires:
+                self.versions[name] = max(self.versions[name], self._least + 1)
         meta = {f"{name}.json": MetaFile(self.versions[name]) for name in parts}
         before = self._present.snapshot
         if before and before.signed.meta == meta and self._can_be_kept(before):
