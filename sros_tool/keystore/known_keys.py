@@ -110,9 +110,9 @@ def certificates_of_revoked(
 
 
 def restored_at(keystore: OpenedKeystore) -> str:
-    """Return when a keystore was last restored, if it still trusts an identity CA of that time.
+    """Return when sros last noticed a restore, if the keystore trusts an identity CA of that time.
 
-    The time is in ISO 8601 (UTC).  Returns "" otherwise.
+    The time is in ISO 8601 (UTC), and later than the backup.  Returns "" otherwise.
     """
     entries = _entries_since_trusted_ca(keystore, keystore.ledger_with("what", RESTORED).entries)
     return next((entry.time for entry in reversed(entries) if entry.what == RESTORED), "")

@@ -400,7 +400,7 @@ class RevocationListSigner:
         if unknown := sorted(lacking):
             why.append(f"it does not have the current certificate of {', '.join(unknown)}")
         if restored := restored_at(self._keystore):
-            why.append(f"the keystore was restored from a backup ({restored})")
+            why.append(f"the keystore was restored from a backup (sros noticed it at {restored})")
         if why:
             text = (
                 f"The ledger of '{self._root}' may lack earlier certificates: {'; '.join(why)}. "
