@@ -29,6 +29,7 @@ from sros_tool.keystore.layout import (
     REQUEST,
     REVOKED,
     has_key,
+    key_on_robot,
     revoked_certificates,
 )
 from sros_tool.keystore.ledger import RECORDED_LATE, REPORTED, RESTORED, Entry, Ledger
@@ -731,6 +732,13 @@ def keys_on_robots_remedy(root: Path, names: Sequence[str]) -> str:
         "make a new key on the robot (docs/howto/rotate.md, A key in wrong hands). Do none of this "
         "for robots that were stolen or removed: revoke them."
     )
+
+
+def new_key_clause(keystore: OpenedKeystore, name: str) -> str:
+    """Return, as a clause, how to give an enclave a new key in place of a revoked one."""
+    if key_on_robot(keystore.folder(name)):
+        return "make a new key on its robot (docs/howto/rotate.md, A key in wrong hands)"
+    return f"`sros renew {quote(str(keystore.root))} {quote(name)} --new-key --revoke-old`"
 
 
 def _key_and_description(certificate: x509.Certificate) -> tuple[str, str]:

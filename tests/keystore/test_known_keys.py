@@ -12,6 +12,7 @@ import pytest
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.delivery.signing import SignedRequests, sign_request
+from sros_tool.keystore.layout import enclave_folder
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
@@ -111,11 +112,20 @@ def test_an_enclave_with_a_revoked_key_is_not_certified_again(
         copy_of(tmp_path / "backup", keystore / "enclaves/a")
         shutil.rmtree(keystore / "revoked")
     before = snapshot(keystore)
-    with pytest.raises(KeystoreError, match=f"key of enclave {name} was revoked"):
-        renew(keystore, [name], now=NOW) if verb == "renew" else rotate_ca(
-            keystore, now=NOW, finish=True
-        )
+
+    def refused() -> str:
+        with pytest.raises(KeystoreError, match=f"key of enclave {name} was revoked") as caught:
+            renew(keystore, [name], now=NOW) if verb == "renew" else rotate_ca(
+                keystore, now=NOW, finish=True
+            )
+        return caught.value.remedy
+
+    assert f"`sros renew {keystore} {name} --new-key --revoke-old`." in refused()
     assert snapshot(keystore) == before
+    key = keystore / enclave_folder(name) / "key.pem"
+    key.rename(key.with_name("request.pem"))  # as if a robot had made it
+    assert "--new-key" not in refused() and "make a new key on its robot" in refused()
+    key.with_name("request.pem").rename(key)
     renew(keystore, [name], now=NOW, new_key=True)
     rotate_ca(keystore, now=NOW, finish=True)
 

@@ -39,6 +39,7 @@ from sros_tool.keystore.issuing.enclave import EnclaveTokens, EnclaveWriter
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.known_keys import (
     KnownKeys,
+    new_key_clause,
     other_keys_remedy,
     unknown_authorities,
     unlisted_revocations,
@@ -363,8 +364,7 @@ class KeystoreChange:
             KeystoreError: the key was revoked.
         """
         public: PublicKey = certificate.public_key()  # type: ignore[assignment]
-        where = f"{quote(str(self.root))} {name}"
-        remedy = f"Give the enclave another key with `sros renew {where} --new-key --revoke-old`."
+        remedy = f"Give the enclave another key: {new_key_clause(self.keystore, name)}."
         self.known.refuse_revoked_key(public, f"enclave {name}", remedy, certificate)
         return public
 

@@ -40,7 +40,7 @@ from sros_tool.keystore.issuing.authority import (
 )
 from sros_tool.keystore.issuing.enclave import EnclaveWriter, Issuance, NewIdentity
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring, check_places
-from sros_tool.keystore.known_keys import unknown_authorities
+from sros_tool.keystore.known_keys import new_key_clause, unknown_authorities
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -885,7 +885,7 @@ def _issuance(
         where = f"{quote(str(root))} {name}"
         remedy = (
             f"Revoke the enclave again: `sros revoke {where}`, or --robot for all enclaves of its "
-            f"robot. To keep the enclave instead: `sros renew {where} --new-key --revoke-old`."
+            f"robot. To keep the enclave instead: {new_key_clause(change.keystore, name)}."
         )
         change.known.refuse_revoked_key(key, f"enclave {name}", remedy, kept, publish_first=False)
         certificate = NewIdentity(kept.subject, key)
