@@ -40,7 +40,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.crl import load_crls, newest_list, read_lists
-from sros_tool.validity import parse_iso
+from sros_tool.validity import duration_text, parse_iso
 from sros_tool.values import DryRun, FileChanges, Notes, as_plain, parse_json
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
@@ -409,9 +409,11 @@ class AgentStatus(NamedTuple):
     the command of ``--restart-if`` exits with 0.
     """
     problems: Sequence[str]
-    """What the last round could not do, and what is wrong with the files now, as sentences."""
+    """What the last round could not do, that source or inbox were not reached within
+    ``--max-age``, and what is wrong with the files now, as sentences.
+    """
     well: bool
-    """Whether nothing is wrong or due, and source and inbox were reached recently."""
+    """Whether nothing is wrong or due, and source and inbox were reached within ``--max-age``."""
 
 
 def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStatus:
@@ -423,13 +425,11 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
         SrosError: the folder has no agent, or its settings are malformed.
     """
     settings, state = read_settings(folder), read_state(folder)
-    recent = all(
-        moment is not None and abs(now - moment) <= oldest for moment in (state.fetched, state.sent)
-    )
     whole = 0 < state.release == state.accepted
     problems = (
         *_outdated_sentences(folder),
         *state.problems,
+        *_unreached_sentences(folder, state, now, oldest),
         *_present_problems(folder, state, now),
     )
     return AgentStatus(
@@ -445,8 +445,25 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
         state.unseen,
         state.waiting,
         problems,
-        recent and whole and not state.due and not problems,
+        whole and not state.due and not problems,
     )
+
+
+def _unreached_sentences(
+    folder: Path, state: AgentState, now: datetime, oldest: timedelta
+) -> Iterator[str]:
+    """Yield a sentence if the source or the inbox was not reached within ``oldest``."""
+    places = {"source": state.fetched, "inbox": state.sent}
+    unreached = [
+        place for place, time in places.items() if time is None or abs(now - time) > oldest
+    ]
+    if unreached:
+        names = " and ".join(f"the {place}" for place in unreached)
+        yield (
+            f"The agent did not reach {names} within --max-age ({duration_text(oldest)}). Check "
+            f"that the agent runs and that the clock is right; `sros agent run "
+            f"{quote(str(folder))} --once` tries now, and names what fails."
+        )
 
 
 def _present_problems(folder: Path, state: AgentState, now: datetime) -> Iterator[str]:

@@ -234,7 +234,9 @@ def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
     sros("agent", "status", r1.folder).ok()
     end = validity_of(read_certificate(r1.folder / "enclaves/r1/a/cert.pem")).not_after
     early = agent_status(r1.folder, now=moment() - timedelta(days=2), oldest=timedelta(days=1))
+    unreached = early.problems[0]
     assert not early.well, "when the source was reached is not known by such a clock"
+    assert unreached.startswith("The agent did not reach the source and the inbox within --max-age")
     late = agent_status(r1.folder, now=end + timedelta(minutes=1), oldest=timedelta(days=9999))
     assert not late.well
     assert sum("expired" in problem for problem in late.problems) == len(NAMES)
