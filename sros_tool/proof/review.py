@@ -384,6 +384,13 @@ class _Policies:
     commit: str
     files: Sequence[Path]
     fleet: Fleet | None
+    unread: SrosError | OSError | None = None
+    """Why a policy of the commit was not read; None if all were."""
+
+    def check_read(self) -> None:
+        """Raise the error of a policy that was not read, if none was read."""
+        if self.unread and not self.files:
+            raise self.unread
 
     def read(self) -> tuple[Policy, ...]:
         """Return the policies for the robots of the fleet.
@@ -396,6 +403,7 @@ class _Policies:
     @cached_property
     def access(self) -> AccessSource:
         """The access that the policies give; reading it may raise an error."""
+        self.check_read()
         return load_policies(self.files, self.commit, self.fleet)
 
     def robots_by_enclave(self) -> dict[str, Robot | None]:
@@ -418,8 +426,8 @@ class _Review:
     base: CommitFiles | None
     robots: dict[str, Fleet | None] = field(default_factory=dict)
     """The fleet of the policy or keystore that a step examines, by subject of the step."""
-    has_all_policies: bool = True
-    """Whether HEAD has every policy of the request."""
+    unread_policy: SrosError | OSError | None = None
+    """Why a policy of the request was not read from HEAD; None if all were read."""
     is_relative: bool = False
     """Whether a requirement has a name that moves with the namespace."""
     namespaces_to_add: set[str] = field(default_factory=set)
@@ -449,12 +457,13 @@ class _Review:
             yield ReviewStep("files", "", _UNDECIDED, refusal)
         head_fleet = yield from self._fleet(self.head)
         base_fleet = yield from self._fleet(self.base)
-        head = _Policies(_HEAD, (yield from self._head_policies(head_fleet)), head_fleet)
+        files = yield from self._head_policies(head_fleet)
+        head = _Policies(_HEAD, files, head_fleet, self.unread_policy)
         base = _Policies(_BASE, (), base_fleet)
         with suppress(SrosError, OSError):  # the comparison reports the error
             base = replace(base, files=self._base_policies(base_fleet))
         named = " ".join(asked.policies)
-        complete = self.has_all_policies
+        complete = head.unread is None
         if head_fleet:
             self.robots[named] = fleet_with_enclaves(head_fleet, head.files)
         yield from self._step_result(
@@ -576,13 +585,17 @@ class _Review:
         """Return the policy files of HEAD; yield a step for each policy that cannot be read."""
 
         def files_at(path: str) -> Sequence[Path]:
-            files = self.head.write_policies(path, placeholders=fleet is not None)
-            if not files:
-                raise self._missing_file_error(path, f" If it is renamed, {_BOTH_NAMES_REMEDY}.")
+            try:
+                files = self.head.write_policies(path, placeholders=fleet is not None)
+                if not files:
+                    advice = f" If it is renamed, {_BOTH_NAMES_REMEDY}."
+                    raise self._missing_file_error(path, advice)
+            except (SrosError, OSError) as error:
+                self.unread_policy = error
+                raise
             return files
 
         read = yield from _read_each("policy", self.request.policies, files_at)
-        self.has_all_policies = len(read) == len(self.request.policies)
         return list(dict.fromkeys(file for files in read.values() for file in files))
 
     def _keystores(self) -> Generator[ReviewStep, None, dict[str, Path]]:
@@ -740,8 +753,12 @@ class _Review:
         entries = dict(changed)
         for path in self._policies_among(changed, self.head):
             content = self.request.repository.content(entries[path].id)
-            if (Path(path).name, content) not in shipped:
-                lines.append((f"{_NOT_USED_TEXT} --leave-out {quote(path)}, or delete it", path))
+            if (Path(path).name, content) in shipped:
+                continue
+            text = f"{_NOT_USED_TEXT} --leave-out {quote(path)}, or delete it"
+            if reviewed.unread and any(map(Path(path).is_relative_to, self.request.policies)):
+                text = "changes and is not reviewed, because a policy could not be read"
+            lines.append((text, path))
         earlier = list(self._changed_files(self.base, self.head))
         for path in self._unreviewed_keystores([*changed, *earlier]):
             if not self._has_entry(self.head, str(Path(path) / ENCLAVES)):
@@ -1015,6 +1032,7 @@ class _Review:
         Raises:
             SrosError: the policies of HEAD cannot be read.
         """
+        head.check_read()
         system = load_system(head.files, self._circumstances(head.fleet), self._template())
         read_base = (lambda: base.access) if base.files else None
         return ReviewedSubject(system, base.fleet, read_base, lambda: head.access)
@@ -1093,7 +1111,7 @@ class _Review:
             partial(self._decided_requirements, required),
             is_wanted=bool(read),
             complete=len(read) == len(self.request.requirements)
-            and (system.is_keystore or self.has_all_policies),
+            and (system.is_keystore or self.unread_policy is None),
         )
         dropped = partial(self._dropped_step, required)
         all_read = len(read) == len(files)

@@ -682,6 +682,10 @@ def test_links_and_submodules_hide_no_policy(
     ended = change.review("--policy", "robot.xml\nrobots", "--leave-out", "tests")
     assert ended.status == status, ended
     assert (path in ended.out) == bool(status)
+    if status == 2:
+        out = " ".join(change.review("--policy", "robots").out.split())
+        assert out.count("could not be decided, for the reason above") == 2, out
+        assert "has no policies" not in out and "Name it with --policy" not in out
 
 
 def _tree(change: Change, *entries: tuple[str, str, str]) -> str:
