@@ -54,9 +54,6 @@ _READING_SECONDS = 0.1
 _START_SECONDS = 30.0
 _END_SECONDS = 3.0
 _MOST_UNREAD_SECONDS = 5.0
-_SHORT_WATCH_SECONDS = 10.0
-"""In a shorter watch, a graph that stands still may look as if it grew until the end: discovery
-takes seconds, and the graph then has to stand still for `Settling.still`."""
 
 
 class Readings(NamedTuple):
@@ -288,7 +285,8 @@ class Snapshot:
     ``everything`` also has the nodes that left while the graph was observed.  ``settled`` says
     whether the graph had stopped changing, or was watched without a gap.  ``intermittent`` are
     endpoints of the nodes in ``observation`` that a watch saw for a part of its time.  ``grew``
-    says whether a watch still found new nodes or endpoints in its last seconds.
+    says whether a watch still found new nodes or endpoints in its last ``Settling().still``
+    seconds.
     """
 
     observation: Observation
@@ -301,13 +299,11 @@ class Snapshot:
     @property
     def unsettled(self) -> str:
         """Why nodes or endpoints may be missing, as a clause; "" if the whole graph was seen."""
-        if self.grew and self.seconds < _SHORT_WATCH_SECONDS:
-            return (
-                f"the watch was shorter than {_SHORT_WATCH_SECONDS:.0f} s, too short to see "
-                "whether new nodes or endpoints still appear"
-            )
         if self.grew:
-            return "new nodes or endpoints still appeared when the watch ended"
+            return (
+                f"new nodes or endpoints still appeared in the last {Settling().still} s of the "
+                f"watch, which took {self.seconds:.0f} s"
+            )
         if self.settled:
             return ""
         return f"the ROS graph kept changing for {self.seconds:.0f} s, or could not be read in time"

@@ -125,8 +125,8 @@ def test_json_names_what_a_watch_saw_for_a_part_of_its_time(
     assert intermittent_from_json(json.loads(ended.out)) == [lost]
     assert json.loads(ended.out)["settled"] is False
     assert ended.err == (
-        "new nodes or endpoints still appeared when the watch ended, so more may be missing; "
-        "watch again for longer.\n"
+        "new nodes or endpoints still appeared in the last 3.5 s of the watch, which took 19 s, so "
+        "more may be missing; watch again for longer.\n"
     )
 
 
