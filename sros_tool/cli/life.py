@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -31,13 +32,14 @@ from sros_tool.cli.common import (
     keystore_arguments,
     now,
     print_json,
+    print_notes,
     progress,
     several_enclaves_options,
     split_root,
     try_passphrase,
     verb,
 )
-from sros_tool.errors import SrosError, UsageError
+from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.terminal import echo
 from sros_tool.wording import first_few, serial_text
 
@@ -337,16 +339,22 @@ def crl(
             f"Show the list: `sros inspect {quote(str(root / 'enclaves'))}/ENCLAVE/crl.pem`.",
         )
     soon = any(revoked.expires_soon_from() < now() for revoked in lists)
+    age_notes = tuple(_age_notes(keystore))
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_lists
 
         enclaves = _enclaves_by_serial(keystore, lists)
-        print_json(shown_lists(keystore, result, enclaves, expires_soon=soon, dry_run=dry_run))
+        lists_shown = shown_lists(
+            keystore, result, enclaves, age_notes, expires_soon=soon, dry_run=dry_run
+        )
+        print_json(lists_shown)
     elif lists:
         for line in _list_lines(lists, _enclaves_by_serial(keystore, lists)):
             echo(line)
     else:
-        echo("nothing was ever revoked", err=True)
+        unknown = "the keystore knows of no revocation"
+        echo(unknown if age_notes else "nothing was ever revoked", err=True)
+    print_notes(age_notes)
     if result and dry_run:
         return 0
     if soon:
@@ -363,6 +371,26 @@ def _read_given_list(path: Path | None) -> bytes:
     from sros_tool.xml import read_bytes
 
     return read_bytes(path, "revocation list") if path else b""
+
+
+def _age_notes(keystore: OpenedKeystore) -> Iterator[Note]:
+    """Yield a note if the keystore is known to be older than its robots."""
+    from sros_tool.keystore.layout import PUBLISHED
+    from sros_tool.keystore.ledger import RESTORED
+
+    with suppress(SrosError):  # `sros check` reports a ledger that cannot be read
+        if not (keystore.entries_of(RESTORED) or keystore.has(PUBLISHED)):
+            return
+        # Most keystores publish nothing, and do not need it.
+        from sros_tool.keystore.delivery.publish import unpublished_restore_clause
+
+        if why := unpublished_restore_clause(keystore):
+            yield Note(
+                "crl.older-keystore",
+                f"the keystore is older than its robots: {why}. It was restored from a backup, or "
+                "is a copy, and may lack later revocations: run `sros fleet status "
+                f"{quote(str(keystore.root))}`, which names the next step.",
+            )
 
 
 def _enclaves_by_serial(

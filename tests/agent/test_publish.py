@@ -891,6 +891,10 @@ def test_a_key_that_was_replaced_after_the_backup_is_not_certified_again(
     publisher.publish()
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
+    shown = sros("crl", publisher.root).ok().err.splitlines()
+    assert shown[0] == "the keystore knows of no revocation" and "may lack later" in shown[1]
+    (note,) = json.loads(sros("crl", publisher.root, "--json").ok().out)["notes"]
+    assert note["id"] == "crl.older-keystore" and note["text"] in shown[1]
     command = f"First run `sros fleet publish {publisher.root} {publisher.pub} --restored`"
     assert command in sros("renew", publisher.root, "/r2/base").err
     rotation = sros("rotate_ca", publisher.root, "--identity", "--finish", "--allow-unconfirmed")

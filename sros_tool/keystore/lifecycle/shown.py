@@ -407,7 +407,7 @@ class KeystoreLists(NamedTuple):
     keystore: NamedKeystore
     dry_run: DryRun
     number: int | None
-    """Number of the list; null if the keystore has no list, because nothing was revoked."""
+    """Number of the list; null if the keystore has no list: it knows of no revocation."""
     this_update: datetime | None
     """Start of the list's validity, in UTC; null if there is no list."""
     next_update: datetime | None
@@ -432,13 +432,15 @@ def shown_lists(
     keystore: OpenedKeystore,
     refreshed_by: Changed | None,
     enclaves: Mapping[str, str],
+    age_notes: Sequence[Note],
     *,
     expires_soon: bool,
     dry_run: bool,
 ) -> KeystoreLists:
     """Return what `crl --json` prints; ``enclaves`` maps serial numbers to enclaves.
 
-    ``refreshed_by`` is the result of signing the list again, or None.
+    ``refreshed_by`` is the result of signing the list again, or None.  ``age_notes`` say that the
+    keystore is older than its robots.
     """
     lists = keystore.revocation_lists
     first = lists[0] if lists else None
@@ -466,7 +468,7 @@ def shown_lists(
         ],
         restart=refreshed_by.restart if refreshed_by else (),
         changes=changes_below(keystore.root, refreshed_by.changes) if refreshed_by else (),
-        notes=(*refreshed_by.notes, *refreshed_by.remarks) if refreshed_by else (),
+        notes=(*(refreshed_by.notes + refreshed_by.remarks if refreshed_by else ()), *age_notes),
     )
 
 
