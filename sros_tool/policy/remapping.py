@@ -277,6 +277,13 @@ def _unused_rule_error(
             f"It is for {enumerated(nodes)}, which --node leaves out.",
             f"Add --node {nodes[0]}, or leave out the rule.",
         )
+    if rule.renames_node and (below := _names_below(rule.node, policies)):
+        options = (f"--remap {name}:={_with_node(name, rule)}" for name in below)
+        return UsageError(
+            f"--remap {rule} matches no node in the policies to merge",
+            f"They have no node {rule.node}, and only use names below it: {enumerated(below)}.",
+            f"Remap each name: `{' '.join(options)}`.",
+        )
     if similar := _similar_names(rule, policies):
         names = " or ".join(similar)
         reason = f"Perhaps the right name is {names}, for example after an update of a package."
@@ -288,6 +295,25 @@ def _unused_rule_error(
         reason,
         "Write the name, and the node if you state one, as in the policy.",
     )
+
+
+def _names_below(node: str, policies: Iterable[Policy]) -> list[str]:
+    """Return the names in policies, as written and without wildcards, below the name of a node."""
+    names = {
+        name
+        for policy in policies
+        for enclave in policy.enclaves
+        for profile in enclave.all_profiles()
+        for group in profile.groups
+        for name in group.names
+        if f"/{node}/" in f"/{name}" and not is_expression(name)
+    }
+    return sorted(names)
+
+
+def _with_node(name: str, rule: Remapping) -> str:
+    """Return a name below the old node of a rule with the rule's new node."""
+    return f"/{name}".replace(f"/{rule.node}/", f"/{rule.new}/", 1)[1:]
 
 
 def _similar_names(rule: Remapping, policies: Iterable[Policy], at_least: float = 0.6) -> list[str]:

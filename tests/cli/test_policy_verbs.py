@@ -184,6 +184,14 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
     ):
         ended = sros(*words, *more, cwd=folder)
         assert (ended.status, said in ended.err) == (2, True), ended
+    panel = policy_text({"/panel": publish("eye/lid", "/front/eye/park", "eyes/lid")})
+    (folder / "cam.xml").write_text(panel)
+    ended = sros(*words, "eye:__node:=left_eye", cwd=folder)
+    assert "no node eye, and only use names below it: /front/eye/park and eye/lid." in ended.err
+    advice = ended.err.split("`")[1].split()
+    ended = sros(*words[:-1], *advice, "--json", cwd=folder).ok()
+    names = {right["name"] for right in json.loads(ended.out)["added"]}
+    assert names == {"/left_eye/lid", "/front/left_eye/park"}
 
 
 def test_a_merge_that_takes_a_counterpart_away_says_so(folder: Path) -> None:
