@@ -400,21 +400,55 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
 
 
 @verb("list_enclaves")
-@keystore_argument()
+@click.argument("root", metavar="[KEYSTORE]", type=PATH, required=False)
 @enclave_filter_options()
+@click.option(
+    "-p",
+    "--policy",
+    "policy_files",
+    type=PATH,
+    multiple=True,
+    metavar="FILE",
+    help="List the enclaves of this policy, not of a keystore.  Can be repeated.",
+)
+@fleet_option("The robots that the placeholders of the policies stand for.")
 @json_option
 def list_enclaves(
-    root: Path, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool
+    root: Path | None,
+    patterns: tuple[str, ...],
+    robots: tuple[str, ...],
+    policy_files: tuple[Path, ...],
+    fleet_file: Path | None,
+    as_json: bool,
 ) -> None:
-    """List the enclaves of KEYSTORE, sorted.
+    """List the enclaves of KEYSTORE, or of policies, sorted.
 
     Example:
       $ sros list_enclaves keystore
       /listener
       /talker
+      $ sros list_enclaves -p robot.xml --fleet fleet.toml --robot r7
+      /r7/base
+      /r7/camera
     """
     from sros_tool.keystore.layout import check_keystore, enclave_names, hidden_enclaves
 
+    if policy_files:
+        if root:
+            raise UsageError(
+                f"the keystore '{root}' and a policy are named",
+                "",
+                "Leave out the one whose enclaves you do not want.",
+            )
+        _list_enclaves_of_policies(policy_files, fleet_file, patterns, robots, as_json)
+        return
+    if fleet_file:
+        raise UsageError(
+            "--fleet fills in placeholders of policies, but no policy is named",
+            "The fleet of a keystore is in the keystore.",
+            "Leave --fleet out, or add -p FILE.",
+        )
+    root = root or keystore_from_environment()
     check_keystore(root)
     if patterns or robots:
         from sros_tool.keystore.reader import OpenedKeystore
@@ -447,6 +481,44 @@ if TYPE_CHECKING:
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.template import NamedValues, Template
     from sros_tool.policy.model import Policy
+
+
+def _list_enclaves_of_policies(
+    files: Sequence[Path],
+    fleet_file: Path | None,
+    patterns: Sequence[str],
+    robots: Sequence[str],
+    as_json: bool,
+) -> None:
+    """Print the enclaves of policies."""
+    from fnmatch import fnmatchcase
+
+    from sros_tool.keystore.selection import EnclaveList
+    from sros_tool.policy.document import read_policy
+
+    if robots and not fleet_file:
+        raise UsageError("--robot needs --fleet for a policy", "", "Add --fleet FILE.")
+    robot_of: dict[str, str] | None = None
+    if fleet_file:
+        policies = fleet_policies(files, fleet_file, robots)
+        stated = {name: policy.stated_enclave(name)[1] for policy in policies for name in policy}
+        robot_of = {name: robot.name for name, robot in stated.items() if robot}
+        names = {*stated}
+    else:
+        names = {enclave.path for file in files for enclave in read_policy(file).enclaves}
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise UsageError(f"no enclave of the policies matches {pattern!r}")
+    listed = sorted(
+        name for name in names if not patterns or any(fnmatchcase(name, p) for p in patterns)
+    )
+    if robot_of is not None:
+        robot_of = {name: robot_of[name] for name in listed if name in robot_of}
+    if as_json:
+        print_json(EnclaveList(None, listed, (), robot_of))
+        return
+    for name in listed:
+        echo(name)
 
 
 @verb("create_keystore")

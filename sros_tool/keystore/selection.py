@@ -13,6 +13,7 @@ from datetime import datetime
 from fnmatch import fnmatchcase
 from functools import partial
 from itertools import islice
+from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
 
@@ -45,21 +46,22 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.crl import signed_by
 from sros_tool.validity import iso
-from sros_tool.values import NamedKeystore, shows
+from sros_tool.values import shows
 from sros_tool.wording import first_few
 
 
 @shows(optional=("robots",))
 class EnclaveList(NamedTuple):
-    """The enclaves of a keystore."""
+    """The enclaves of a keystore, or of policies."""
 
-    keystore: NamedKeystore
+    keystore: Path | None
+    """Path of the keystore, as the user gave it; null for the enclaves of policies."""
     enclaves: Sequence[str]
     """Names of the enclaves, sorted."""
     hidden: Sequence[str]
     """Names of enclaves in hidden folders, sorted; DDS loads them, but sros leaves them out."""
     robots: Mapping[str, str] | None
-    """Maps each enclave of a robot to the robot; null for a keystore without a fleet."""
+    """Maps each enclave of a robot to the robot; null without a fleet."""
 
 
 def robots_of(keystore: OpenedKeystore, names: Sequence[str]) -> dict[str, str] | None:

@@ -204,7 +204,13 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks --domain 0,7 --set authorities.validity=20y --allow-looser"),
         Case("ks --template development"),
     ),
-    "list_enclaves": (Case("ks"), Case("empty"), Case("fleet --robot a"), Case("ks --match *")),
+    "list_enclaves": (
+        Case("ks"),
+        Case("empty"),
+        Case("fleet --robot a"),
+        Case("ks --match *"),
+        Case("-p policy.xml"),
+    ),
     "inspect": (
         Case("ks"),
         Case("token"),

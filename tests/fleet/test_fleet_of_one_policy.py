@@ -23,7 +23,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
 from tests.support.children import LONG
-from tests.support.harness import copy_of, policy_text, publish, snapshot, sros, topics_of
+from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros, topics_of
 
 ROBOTS = sorted(f"r{number}" for number in range(1, 51 if LONG else 17))
 CARRIERS = [name for name in ROBOTS if int(name[1:]) % 2]
@@ -447,3 +447,24 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     (folder / "ks/fleet.toml").write_text(other_paths)
     sros(*create_again, cwd=folder).ok()
     assert (folder / "ks/fleet.toml").read_bytes() == record, "without the paths of the edit"
+
+
+def test_the_enclaves_that_policies_give_a_robot_are_listed(tmp_path: Path) -> None:
+    """A robot needs their names to make its keys, before the keystore has the enclaves."""
+    paths = ("/{robot}/base", "/{robot:arms}/hand", "/{robot}/arm", "/office")
+    (tmp_path / "p.xml").write_text(policy_text({path: publish("x") for path in paths}))
+    (tmp_path / "f.toml").write_text('[robots.r1]\ngroups = ["arms"]\n[robots.r2]\n')
+
+    def listed(*options: str) -> Ended:
+        return sros("list_enclaves", *options, cwd=tmp_path)
+
+    options = ("-p", "p.xml", "--fleet", "f.toml")
+    assert listed(*options, "--robot", "r1").ok().out == "/r1/arm\n/r1/base\n/r1/hand\n"
+    assert listed(*options, "--match", "*base", "--match", "/o*").ok().out.split() == [
+        *("/office", "/r1/base", "/r2/base")
+    ]
+    found = json.loads(listed(*options, "--match", "*hand", "--json").ok().out)
+    assert (found["keystore"], found["robots"]) == (None, {"/r1/hand": "r1"})
+    for wrong in (("ks", *options), ("-p", "p.xml", "--robot", "r1"), ("--fleet", "f.toml")):
+        assert listed(*wrong).status == 2
+    assert "no enclave of the policies matches" in listed(*options, "--match", "/x").err
