@@ -843,6 +843,7 @@ def _lines(
 def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield sentences about the fleet as a whole."""
     from sros_tool.keystore.fleet import fleet_edits_remedy
+    from sros_tool.keystore.known_keys import lacking_enclaves_remedy
     from sros_tool.validity import elapsed
 
     status = compared_fleet.status
@@ -886,6 +887,12 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             "known whether robots can fetch, or whether the keystore is older than its robots. "
             f"`{publish}` names the remedy. If the folder belongs on another machine, add "
             "`--fail-on seen`"
+        )
+    if lost := [robot.robot for robot in status.robots if robot.is_lost]:
+        names = _robot_names(lost, status.names, status.groups)
+        yield (
+            f"the keystore was restored, and lacks enclaves of {names}, whose certificates stay "
+            f"valid. {lacking_enclaves_remedy(status.keystore)}"
         )
     if publication and publication.altered:
         ago = elapsed(compared_fleet.at - max(publication.altered.values()))

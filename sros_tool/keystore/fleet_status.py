@@ -338,6 +338,7 @@ class RobotStatus:
     reported: int = 0
     is_behind: bool = False
     has_low_sequence: bool = False
+    is_lost: bool = False
 
     @property
     def is_published(self) -> bool:
@@ -363,10 +364,11 @@ class RobotStatus:
         """Whether there is nothing to do: the files are current and the agent reports no problem.
 
         A robot without enclaves is settled, too.  A revoked robot is settled once its enclaves are
-        gone, because only the other robots need the revocation list.
+        gone, because only the other robots need the revocation list, unless it has a certificate
+        from after the backup of the keystore that is not revoked (``is_lost``).
         """
         if self.state is State.REVOKED:
-            return not self.enclaves
+            return not (self.enclaves or self.is_lost)
         return self.state is State.NONE or (self.state is State.CURRENT and not self.problems)
 
     @property
@@ -459,7 +461,8 @@ class RobotStatus:
         robots accept the published metadata.
         """
         if self.state is State.REVOKED and not self.enclaves:
-            return "take it out of the fleet file"
+            again = "sign its requests again, or revoke it"
+            return again if self.is_lost else "take it out of the fleet file"
         if self._shows_wrong_clock(now, limit):
             return "check its clock"
         if self.state in (State.CURRENT, State.NONE):
@@ -668,7 +671,8 @@ class FleetStatus:
         every robot with enclaves confirmed the current files in time, no restart is due, no agent
         reports a problem, robots can still fetch the published releases, no published file was
         altered in the last day, and there is no other doubt about the robots' files.  Robots whose
-        enclaves were all revoked do not count.
+        enclaves were all revoked do not count, unless a restored keystore lacks a certificate of
+        the robot that is not revoked.
         """
         return self.is_settled()
 
@@ -736,7 +740,8 @@ def fleet_status(
 ) -> FleetStatus:
     """Return the deployment status of the named robots, or of the whole fleet.
 
-    With ``now``, enclaves of robots that left the fleet are left out if they have expired.
+    With ``now``, enclaves of robots that left the fleet are left out if they have expired, and
+    certificates that a restored keystore lacks do not count if they have expired.
 
     Raises:
         KeystoreError: the keystore has no fleet, or some of its enclaves may be missing.
@@ -751,7 +756,8 @@ def fleet_status(
     unassigned = 0 if names else len(existing) - sum(len(robot.enclaves) for robot in compared)
     unrecorded = unrecorded_enclaves(fleet, existing, {robot.name for robot in robots})
     statuses = tuple(
-        _robot_status(robot, records, stages, unrecorded[robot.robot.name]) for robot in compared
+        _robot_status(robot, records, stages, unrecorded[robot.robot.name], now)
+        for robot in compared
     )
     if older := records.age_clause:  # there may be a later list that the keystore lacks
         statuses = tuple(status.without_list() for status in statuses)
@@ -1326,6 +1332,22 @@ class _KeystoreRecords:
         names.update(self._unrecorded[robot.name].below)
         return tuple(sorted(name for name in names if not self._keystore.has_enclave(name)))
 
+    def is_lost(self, compared_robot: _ComparedRobot, now: datetime | None) -> bool:
+        """Return whether a restored keystore lacks an enclave that has a certificate of its own.
+
+        Messages or published releases showed the certificate, which is not revoked.  With ``now``,
+        expired certificates do not count.
+        """
+        if compared_robot.enclaves or not self.was_restored:
+            return False
+        names = {*enclaves_of(self._fleet, compared_robot.robot)}
+        shown = KnownKeys(self._keystore).certificates_shown_after_restore(names)
+        moment = iso(now) if now else ""
+        return any(
+            entry.serial not in self._revoked_serials and entry.not_after > moment
+            for entry in shown
+        )
+
     def short_lived(self, first_expiring: Mapping[str, _FileValidity]) -> tuple[str, ...]:
         """Return the short-lived enclaves of the files in ``first_expiring``.
 
@@ -1644,6 +1666,7 @@ def _robot_status(
     records: _KeystoreRecords,
     stages: _Stages,
     unrecorded: UnrecordedEnclaves,
+    now: datetime | None,
 ) -> RobotStatus:
     facts = _RobotFacts(compared_robot, records)
     received, confirmed = facts.received, facts.confirmed
@@ -1687,6 +1710,7 @@ def _robot_status(
         reported=len(facts.reported),
         is_behind=bool(confirmed and confirmed.clock is RobotClock.BEHIND),
         has_low_sequence=bool(facts.refusal and facts.refusal.why.startswith(LOW_SEQUENCE)),
+        is_lost=facts.state is State.REVOKED and records.is_lost(compared_robot, now),
     )
 
 

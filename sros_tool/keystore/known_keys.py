@@ -734,6 +734,19 @@ def keys_on_robots_remedy(root: Path, names: Sequence[str]) -> str:
     )
 
 
+def lacking_enclaves_remedy(root: Path) -> str:
+    """Return what to do about enclaves that a restored keystore lacks; no full stop at the end."""
+    where = quote(str(root))
+    return (
+        "If the robot of such an enclave stays in use, and made its keys, sign its requests again: "
+        f"`sros sign_request {where} REQUEST --no-answer -p POLICY_FILE --fleet FLEET_FILE "
+        "--enclave ENCLAVE`. If it did not make its keys, create its enclaves again with `sros "
+        f"generate_artifacts`, then give them new keys: `sros renew {where} --robot NAME --new-key "
+        "--revoke-old`. To revoke such an enclave, create it again first, or replace the CA with "
+        "`sros rotate_ca`"
+    )
+
+
 def new_key_clause(keystore: OpenedKeystore, name: str) -> str:
     """Return, as a clause, how to give an enclave a new key in place of a revoked one."""
     if key_on_robot(keystore.folder(name)):

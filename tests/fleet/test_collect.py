@@ -791,12 +791,16 @@ def test_what_only_robots_know_to_be_revoked_is_revoked_again(home: Home) -> Non
 def test_what_the_ca_signed_counts_in_a_message_that_does_not(home: Home) -> None:
     """Its certificate can be revoked then, and vouches for nothing; its list revokes."""
     backup = copy_of(home.root, home.folder / "backup")
-    home.run("revoke", "ks", "--robot", "r2")
+    for robot in ("r2", "r3"):
+        home.run("revoke", "ks", "--robot", robot)
+    home.run("create_enclave", "ks", "/r2/base")
     home.run("renew", "ks", "/r1/base")
-    home.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
+    for robot in ("r1", "r2"):
+        home.run("distribute_key", "ks", "--robot", robot, robot, "--force")
     later = home.certificate("/r1/base")
     crl = (home.folder / "r1/enclaves/r1/base/crl.pem").read_text()
     home.send("r1", crl=crl, requests=(home.request("r1"),))
+    home.send("r2")
     shutil.rmtree(home.root)
     backup.rename(home.root)
     for notes in (["fleet.revocations-restored", "fleet.certificates-restored"], []):
@@ -808,6 +812,12 @@ def test_what_the_ca_signed_counts_in_a_message_that_does_not(home: Home) -> Non
     assert "restored from a backup" in sros("revoke", "ks", "/r1/base", cwd=home.folder).err
     crl_at_home = OpenedKeystore(home.root).revocation_list
     assert crl_at_home and crl_at_home.revokes(later.serial_number)
+    status = sros("fleet", "status", "ks", cwd=home.folder).out
+    assert re.search("r2 +revoked .* sign its requests again, or revoke it", status), status
+    assert re.search("r3 +revoked .* take it out of the fleet file", status)
+    assert "lacks enclaves of r2, whose certificates stay valid. If the robot of such" in status
+    _, r2, r3 = fleet_status(OpenedKeystore(home.root)).robots
+    assert r3.is_settled and not r2.is_settled
 
 
 def test_a_certificate_of_a_revoked_robot_is_revoked_when_it_becomes_known(home: Home) -> None:

@@ -14,7 +14,12 @@ from typing import Unpack
 
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
-from sros_tool.keystore.known_keys import keys_on_robots_remedy, other_keys_remedy, revoked_serials
+from sros_tool.keystore.known_keys import (
+    keys_on_robots_remedy,
+    lacking_enclaves_remedy,
+    other_keys_remedy,
+    revoked_serials,
+)
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY,
@@ -429,7 +434,7 @@ def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) ->
 
 def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     """Return a note on certificates that are recorded now, or would be without ``dry_run``."""
-    root, has = quote(str(change.root)), "would have" if change.dry_run else "has"
+    has = "would have" if change.dry_run else "has"
     text = (
         f"the keystore issued {counted(len(unknown), 'certificate')} that its ledger lacks: the "
         f"keystore was restored from a backup, or is a copy. The ledger {has} each certificate "
@@ -440,12 +445,7 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     if missing := [name for name in valid if not change.keystore.has_enclave(name)]:
         text += (
             f". The keystore lacks {first_few(missing, _MOST_SHOWN)}, whose certificates stay "
-            "valid. If the robot of such an enclave stays in use, and made its keys, sign its "
-            f"requests again: `sros sign_request {root} REQUEST --no-answer -p POLICY_FILE --fleet "
-            "FLEET_FILE --enclave ENCLAVE`. If it did not make its keys, create its enclaves again "
-            f"with `sros generate_artifacts`, then give them new keys: `sros renew {root} --robot "
-            "NAME --new-key --revoke-old`. To revoke such an enclave, create it again first, or "
-            "replace the CA with `sros rotate_ca`"
+            f"valid. {lacking_enclaves_remedy(change.root)}"
         )
     unknowing = change.known.made_unknowing({*valid, *change.names}, unknown.values())
     if others := sorted({*unknowing.values()}):
