@@ -526,7 +526,7 @@ class PublishedMetadata:
     the last publication was by a release of sros that recorded no expiry.
     """
     accepted: bool | None = None
-    """Whether robots still accept the metadata; null if ``expires`` is null."""
+    """Whether robots still accept the published files; null if ``expires`` is null."""
     unseen: str = ""
     """Why ``folder`` cannot be examined here, as a clause: it is not on this machine, or the
     package ``tuf`` is missing. Then sros does not know whether robots can fetch, or whether the
@@ -537,8 +537,8 @@ class PublishedMetadata:
     archive.  Null if nothing is missing, or if the folder is ``unseen``.
     """
     refused: str = ""
-    """Why the metadata in ``folder`` does not verify, as a clause; robots refuse such metadata.
-    Null if the metadata verifies, or if the folder is ``unseen``.
+    """Why the metadata or an archive in ``folder`` does not verify, as a clause; robots refuse such
+    files. Null if all verify, or if the folder is ``unseen``.
     """
     altered: Mapping[str, datetime] = field(default_factory=dict)
     """Files that ``sros fleet publish`` put right in the last day, because they were missing,
@@ -1054,6 +1054,9 @@ class _KeystoreRecords:
 
         published = read_published(keystore)
         missing = published.first_missing()
+        unseen, refused = unseen_clause(missing), publication_problem(keystore)
+        if not (unseen or refused) and (altered := published.first_altered()):
+            refused = f"'{published.folder}' has a changed archive: {altered}"
         self._published = published.robots
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
         """Maps robots to the number of the release that was published last for them."""
@@ -1062,9 +1065,9 @@ class _KeystoreRecords:
                 published.folder,
                 published.until,
                 published.root_until,
-                unseen=unseen_clause(missing),
+                unseen=unseen,
                 lacks=missing or "",
-                refused=publication_problem(keystore),
+                refused=refused,
                 altered=published.altered,
             )
             if published.robots

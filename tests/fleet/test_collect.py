@@ -1355,6 +1355,12 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
     (home.folder / "kept").rename(targets)
     publish = ("fleet", "publish", "ks", str(pub))
     command = f"`sros {' '.join(publish)}`"
+    data = (pub / archive).read_bytes()
+    for changed in (data[:-1] + bytes([data[-1] ^ 1]), data + b"x"):
+        (pub / archive).write_bytes(changed)
+        ended = sros(*status, cwd=home.folder)
+        assert f"'{pub}' has a changed archive: {archive}. Run {command}" in ended.out
+        assert ended.status == 1
     (pub / archive).unlink()
     ended = sros(*status, cwd=home.folder)
     assert f"'{pub}' lacks {archive}, which robots fetch: run {command}\n" in ended.out

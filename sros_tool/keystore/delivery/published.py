@@ -155,6 +155,22 @@ class PublicationRecord:
                 return next((path for path in paths if not Path(self.folder, path).exists()), "")
         return None
 
+    def first_altered(self) -> str:
+        """Return the first archive in the publishing folder that is not as published, or "".
+
+        Archives that are missing or cannot be read are left out.
+        """
+        for name, robot in sorted(self.robots.items()) if self.folder else ():
+            path, length = robot.release.path(name), robot.release.length
+            with suppress(SrosError, OSError):
+                file = Path(self.folder, path)
+                if file.stat().st_size != length:
+                    return path
+                data = read_bytes(file, "archive", max_bytes=length)
+                if hashlib.sha256(data).hexdigest() != robot.release.sha256:
+                    return path
+        return ""
+
     def document(self, now: datetime) -> bytes:
         """Return the content of ``published.json``."""
         robots = {name: _robot_as_json(robot) for name, robot in sorted(self.robots.items())}
