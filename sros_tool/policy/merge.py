@@ -33,6 +33,7 @@ from sros_tool.policy.model import (
     Level,
     Policy,
     Qualifier,
+    nodes_in_several_enclaves,
     nodes_in_several_namespaces,
     stated_protections,
 )
@@ -420,8 +421,9 @@ class Merged:
     """A policy file after a merge: its new content, the added rights, and the contradictions.
 
     If no right is added, ``document`` is the unchanged content of the file.  ``rights`` are all
-    rights after the merge.  ``notes`` are about denials that win, and about enclaves that, since
-    the merge, have several nodes, or a node in several namespaces.
+    rights after the merge.  ``notes`` are about denials that win, about enclaves that, since the
+    merge, have several nodes, or a node in several namespaces, and about nodes that now have
+    several enclaves.
     """
 
     document: bytes
@@ -486,10 +488,20 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
         for (enclave, node), profiles in nodes_in_several_namespaces(before.enclaves).items()
         if first_nodes.get((enclave, node), ()) != profiles
     )
+    first_places = nodes_in_several_enclaves(first.enclaves)
+    twice = (
+        f"the node {node} is now in {first_few([*places], _MOST_SHOWN)}, but names of nodes are "
+        "unique in ROS, and a process runs in one enclave. If these are two programs, merge with "
+        "another --namespace, or with --remap __node:=NAME. If they are one program, merge with "
+        f"--enclave {next(iter(places))}."
+        for node, places in nodes_in_several_enclaves(before.enclaves).items()
+        if first_places.get(node, {}).keys() != places.keys()
+    )
     notes = (
         *merge_notes(contradictions),
         *(Note("merge.several-instances", text) for text in several),
         *(Note("merge.shared-enclave", text) for text in shared),
+        *(Note("merge.node-in-two-enclaves", text) for text in twice),
     )
     rights = frozenset(policy_rights(before))
     return Merged(document, tuple(added), tuple(contradictions), rights, notes)

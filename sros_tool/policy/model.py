@@ -203,6 +203,20 @@ def nodes_in_several_namespaces(
     return {key: tuple(by_ns.values()) for key, by_ns in profiles_by_node.items() if len(by_ns) > 1}
 
 
+def nodes_in_several_enclaves(enclaves: Iterable[Enclave]) -> dict[str, dict[str, Source]]:
+    """Map the full name of each node with several enclaves to these enclaves and their profiles.
+
+    Nodes whose names have wildcards are left out.
+    """
+    places: dict[str, dict[str, Source]] = {}
+    for enclave in enclaves:
+        for profile in enclave.all_profiles():
+            node = profile.full_name
+            if profile.node and not is_expression(node):
+                places.setdefault(node, {}).setdefault(enclave.path, profile.source)
+    return {node: of_node for node, of_node in places.items() if len(of_node) > 1}
+
+
 @dataclass(frozen=True, slots=True)
 class Policy:
     """A policy with its includes resolved; each enclave path occurs once.

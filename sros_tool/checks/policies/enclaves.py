@@ -9,7 +9,14 @@ from itertools import islice
 from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.policies.statements import CheckedPolicy
 from sros_tool.names import PARAMETER_SERVICES, is_expression
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Source, nodes_in_several_namespaces
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    Enclave,
+    Policy,
+    nodes_in_several_enclaves,
+    nodes_in_several_namespaces,
+)
 from sros_tool.policy.node_basics import are_basic
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers
 from sros_tool.policy.rights import Right, Rules, policy_rights
@@ -206,14 +213,7 @@ def duplicate_enclave_findings(enclaves: Iterable[Enclave]) -> Iterator[Finding]
 
 def node_in_two_enclaves_findings(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
     """Yield a finding for each node without wildcards in its name that several enclaves have."""
-    by_node: dict[str, dict[str, Source]] = defaultdict(dict)
-    for enclave in enclaves:
-        for profile in enclave.all_profiles():
-            node = profile.full_name
-            if profile.node and not is_expression(node):
-                by_node[node].setdefault(enclave.path, profile.source)
-    for node, places in by_node.items():
-        if len(places) > 1:
-            path, source = [*places.items()][1]
-            text = f"the node {node} is in {first_few([*places], _NAMES_SHOWN)}"
-            yield NODE_IN_TWO_ENCLAVES.found(path, text, source.file, source.line)
+    for node, places in nodes_in_several_enclaves(enclaves).items():
+        path, source = [*places.items()][1]
+        text = f"the node {node} is in {first_few([*places], _NAMES_SHOWN)}"
+        yield NODE_IN_TWO_ENCLAVES.found(path, text, source.file, source.line)
