@@ -846,11 +846,12 @@ def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
 
     Only requirements with relative names have this remedy.
     """
-    if not requirement.is_relative or not isinstance(requirement, RightsRequirement):
+    names = _names_that_move(requirement)
+    if not names:
         return ""
     allowed = [right for right in rights if right.qualifier is ALLOW]
     stated = {right.name for right in allowed}
-    absent = (name for _, names in requirement.rights for name in names if name not in stated)
+    absent = (name for name in names if name not in stated)
     was_moved = requirement.elsewhere is None
     for name in absent:
         space = requirement.namespace
@@ -868,6 +869,19 @@ def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
                 "correct the name, here or in the policy."
             )
     return ""
+
+
+def _names_that_move(requirement: Requirement) -> list[str]:
+    """Return the names in a requirement with relative names, or []."""
+    match requirement:
+        case Requirement(is_relative=False):
+            return []
+        case RightsRequirement():
+            return [name for _, of_right in requirement.rights for name in of_right]
+        case Protected():
+            return [name for _, name in requirement.names]
+        case _:
+            return []
 
 
 def _namespaces_with(name: str, requirement: Requirement, allowed: Collection[Right]) -> set[str]:
@@ -893,9 +907,7 @@ def common_namespaces(requirements: Iterable[Requirement], rights: Iterable[Righ
     allowed = [right for right in rights if right.qualifier is ALLOW]
     common: set[str] | None = None
     for requirement in requirements:
-        if not requirement.is_relative or not isinstance(requirement, RightsRequirement):
-            continue
-        names = [name for _, of_right in requirement.rights for name in of_right]
+        names = _names_that_move(requirement)
         if all(map(is_expression, names)):
             continue
         namespaces = set[str]().union(

@@ -643,11 +643,14 @@ def test_the_namespace_of_a_package_that_requirements_lack_is_named(
         for place, own in places.items()
     }
     enclave = "/a" if name.endswith("x") else "//panel"
-    text = f'[[only]]\npublish = ["{name}"]\nenclaves = ["{enclave}"]'.encode()
-    required = parse_requirements(text, "r.toml", namespaces=namespaces)
-    (finding,) = (e for e in requirement_findings(required, robot(rights)) if e.id == VACUOUS)
-    told = "its namespace on the robot: `--namespace /left --namespace /right`."
-    assert (told in finding.remedy) is is_told
+    told = "its namespace on the robot: `--namespace "
+    for text, options in (
+        (f'[[only]]\npublish = ["{name}"]\nenclaves = ["{enclave}"]', "/left --namespace /right`."),
+        (f'[[protected]]\ntopics = ["{name}"]\nlevel = "sign"', ""),
+    ):
+        required = parse_requirements(text.encode(), "r.toml", namespaces=namespaces)
+        (finding,) = (e for e in requirement_findings(required, robot(rights)) if e.id == VACUOUS)
+        assert (told + options in finding.remedy) is is_told
 
 
 def test_whom_nobody_reaches_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
