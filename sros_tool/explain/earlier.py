@@ -146,7 +146,7 @@ def note_on_revoked_enclaves(
         text = (
             f"{first_few(sorted(removed), 3)} {'were' if len(removed) > 1 else 'was'} removed from "
             "the keystore, and not revoked. Whoever kept the files may have the right, until "
-            f"{max(removed.values())}. To revoke an enclave, create it again (`sros create_enclave "
+            f"{_ends_text(removed)}. To revoke an enclave, create it again (`sros create_enclave "
             f"{root} ENCLAVE`), and run `sros revoke {root} ENCLAVE`."
         )
         yield Note("explain.removed-enclaves", text)
@@ -169,7 +169,7 @@ def note_on_revoked_enclaves(
         if gone:
             text = (
                 f"revoked certificates of {first_few(sorted(gone), 3)} {has_right}. A process "
-                f"without {old} still accepts them, until {max(gone.values())}: each process has "
+                f"without {old} still accepts them, until {_ends_text(gone)}: each process has "
                 f"to load {remedy}."
             )
             yield Note(kind, text)
@@ -177,10 +177,20 @@ def note_on_revoked_enclaves(
     if again and vendor is None:
         text = (
             f"whoever kept a revoked certificate of {first_few(sorted(again), 3)} and its key may "
-            f"do it, too, until {max(again.values())}: Zenoh has no revocation list. Give the "
+            f"do it, too, until {_ends_text(again)}: Zenoh has no revocation list. Give the "
             f"enclave another name, or run `sros rotate_ca {root}`."
         )
         yield Note(kind, text)
+
+
+def _ends_text(ends: Mapping[str, str]) -> str:
+    """Return when the certificates of enclaves expire: one moment, or, if the days differ, the last
+    ones with their enclaves.
+    """
+    if len({end[:10] for end in ends.values()}) == 1:
+        return max(ends.values())
+    names = sorted(ends, key=lambda name: ends[name], reverse=True)
+    return first_few([f"{ends[name]} ({name})" for name in names], 3)
 
 
 class _RevokedEnclave(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -880,7 +881,9 @@ def revoked_notes(*words: str | Path) -> str:
     return "\n".join(line for line in lines if "explain.revoked-enclaves" in line)
 
 
-def test_a_revoked_enclave_that_processes_without_the_list_still_accept(keystore: Path) -> None:
+def test_a_revoked_enclave_that_processes_without_the_list_still_accept(
+    keystore: Path, tmp_path: Path
+) -> None:
     asked = (keystore, "--who", "publish", "/chatter")
     assert not revoked_notes(*asked)
     sros("revoke", keystore, ENCLAVE).ok()
@@ -901,6 +904,17 @@ def test_a_revoked_enclave_that_processes_without_the_list_still_accept(keystore
     permissions.write_bytes(kept)
     (keystore / "ledger.jsonl").rename(keystore / "kept")
     assert "accept revoked certificates: ledger.jsonl is missing" in revoked_notes(*other)
+    (keystore / "kept").rename(keystore / "ledger.jsonl")
+    # An enclave whose certificate ends much earlier has a date of its own.
+    settings = keystore / "sros.toml"
+    entry = '[[enclaves]]\nnames = ["/brief"]\nvalidity = "3d"\n'
+    settings.write_text(settings.read_text() + entry)
+    (policy := tmp_path / "brief.xml").write_text(policy_text({"/brief": publish("/chatter")}))
+    sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
+    sros("revoke", keystore, "/brief").ok()
+    day = "[0-9-]{10}T[0-9:]{8}Z"
+    dates = rf"accepts them, until {day} \({ENCLAVE}\), {day} \(/brief\): each process"
+    assert re.search(dates, revoked_notes(*asked))
 
 
 @pytest.mark.parametrize("vendor", ["fastdds", "zenoh"])
