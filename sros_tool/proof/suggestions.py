@@ -427,7 +427,8 @@ def _with_lists(requirement: Requirement, change: Callable[[Names, str], Names])
 _HEADING = """\
 # Requirements that hold for {sources} today, for all names that could ever be used.
 # Keep the requirements that have to hold tomorrow, say why, and delete the others.
-# In a package, leave out the first "/" of names that its users put into a namespace.
+# In a package, leave out the first "/" of names that its users put into a namespace, and make the
+# other changes of docs/howto/package.md (Requirements for a package).
 """
 
 

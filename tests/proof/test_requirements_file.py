@@ -208,6 +208,9 @@ def test_proposals_have_no_name_that_the_file_could_not_have() -> None:
     }
     world = World("a world", sides, confirm=lambda *_: True, stated_access=sides)
     text = render_requirements(suggest(rights, [world]).requirements, ['a "file"\n'])
+    page, section = "docs/howto/package.md", "Requirements for a package"
+    assert f"# other changes of {page} ({section}).\n\n" in text
+    assert f"\n### {section}\n" in (Path(__file__).parents[2] / page).read_text()
     found = parse_requirements(text.encode(), "r.toml")
     assert [demand(each) for each in found][:1] == ["only /e may publish /ok"]
     assert "/* (but not /operator/*) may use wildcards only to publish /fine*" in map(demand, found)
