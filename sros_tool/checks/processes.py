@@ -622,6 +622,17 @@ PROCESS_OTHER_FOLDER = FindingKind(
     "Stop the process, start it from the folder that gets new files (`sros run KEYSTORE ENCLAVE -- "
     "COMMAND...`), and remove the copy.",
 )
+PROCESS_COPIED_ENCLAVE = FindingKind(
+    "runtime.process-copied-enclave",
+    WARNING,
+    "two processes that run in one enclave from different folders",
+    "Whoever has a copy of an enclave's files has all its rights. Files that are delivered to one "
+    "folder, such as a revocation list, do not reach processes from the other folder.",
+    "rcl 9 (rcl/src/rcl/security.c): ROS_SECURITY_KEYSTORE names the folder.",
+    "If you did not start the process, stop it, and replace the key of the enclave "
+    "(docs/howto/rotate.md, A key in wrong hands). Otherwise start both processes from one folder, "
+    "and remove the copy.",
+)
 ZENOH_UNREAD = FindingKind(
     "runtime.zenoh-process-unread",
     WARNING,
@@ -728,8 +739,12 @@ def _security_of(process: Process) -> Security:
 
 
 def security_counts_text(running: RunningProcesses) -> str:
-    """Return how many processes run secured and open, as a clause; "" without any process."""
-    counts = Counter(_security_of(node) for node in running.processes if not node.is_daemon)
+    """Return how many processes run secured and open, as a clause; "" without any process.
+
+    If the enclaves of secured processes are in several folders, the clause names the folders.
+    """
+    security = [(node, _security_of(node)) for node in running.processes if not node.is_daemon]
+    counts = Counter(of_node for _, of_node in security)
     texts = [f"{counts[Security.SECURED]} secured", f"{counts[Security.OPEN]} open"]
     if unknown := counts[Security.UNKNOWN]:
         texts.append(f"{unknown} perhaps open")
@@ -739,7 +754,11 @@ def security_counts_text(running: RunningProcesses) -> str:
         unseen = f" ({number} could not be examined)"
     if not (counts or unseen):
         return ""
-    return f"processes that use ROS 2, DDS or Zenoh: {', '.join(texts)}{unseen}"
+    secured = [node for node, of_node in security if of_node is Security.SECURED]
+    folders = Counter(f"'{_keystore(node)}'" for node in secured)
+    numbers = [f"{folder} ({number})" for folder, number in folders.most_common()]
+    whence = f"; secured from {enumerated(numbers)}" if len({*map(_folder_of, secured)}) > 1 else ""
+    return f"processes that use ROS 2, DDS or Zenoh: {', '.join(texts)}{unseen}{whence}"
 
 
 def process_findings(
@@ -799,6 +818,7 @@ def process_findings(
     yield from _mixed_vendor_findings(secured, environment if starts_nodes else None)
     yield from _other_keystore_findings(secured, environment if is_secured_here else None)
     for _, processes in group_by_authorities(secured):
+        yield from _copied_enclave_findings(processes)
         connections = connections_between(with_time_to_connect(processes, now))
         yield from connection_findings(connections.missing)
     if is_secured_here and environment.get(KEYSTORE):
@@ -1063,6 +1083,32 @@ def _other_keystore_findings(
         for process in (process for group in other_groups for process in group):
             text = f"it has keystore '{_keystore(process)}', but {main}"
             yield PROCESS_OTHER_KEYSTORE.found(process.label, text)
+
+
+def _copied_enclave_findings(processes: Sequence[Process]) -> Iterator[Finding]:
+    """Yield a finding for each process whose enclave another process loaded from another folder.
+
+    ``processes`` trust the same identity CA.  The folder with the most processes counts as the
+    original.
+    """
+
+    numbers = Counter(map(_folder_of, processes))
+    first: dict[str, Process] = {}
+    for process in sorted(processes, key=lambda each: (-numbers[_folder_of(each)], each.pid)):
+        assert process.enclave
+        name = f"/{process.enclave.name.strip('/')}"
+        other = first.setdefault(name, process)
+        if _folder_of(other) != _folder_of(process):
+            text = (
+                f"it runs in {plain(name, _LONGEST_PATH)} from '{_keystore(process)}', and "
+                f"{other.label} from '{_keystore(other)}'"
+            )
+            yield PROCESS_COPIED_ENCLAVE.found(process.label, text)
+
+
+def _folder_of(process: Process) -> object:
+    """Return a value that is the same for all processes whose enclaves are in one folder."""
+    return (process.enclave and process.enclave.folders[:1]) or _keystore(process)
 
 
 def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterator[Finding]:

@@ -515,8 +515,9 @@ def _proof_of_processes(
             finding.text if finding.subject == "processes" else f"{finding.subject}: {finding.text}"
             for finding in wrong or findings
         ]
-        done = "" if wrong else f"true for {number}; "
-        text = f"{done}{first_few(texts, MOST_NAMES, '; ')}"
+        text = first_few(texts, MOST_NAMES, "; ")
+        if not wrong:
+            text = f"true for {number}; {text}: they may run open, or with a copied key"
     else:
         text += "".join(f"; {guest}" for guest in _texts_of_all(_open_in_other_domains, looks))
     return Proof(STARTED, False if wrong else None if findings else True, text)

@@ -205,6 +205,14 @@ def _from_an_older_copy(state: RuntimeState, bench: Bench) -> RuntimeState:
     return running(0, **{KEYSTORE: str(older)})(state, bench)
 
 
+def _from_a_copy(state: RuntimeState, bench: Bench) -> RuntimeState:
+    """The copy has the same files."""
+    copy = shutil.copytree(state.environment[KEYSTORE], bench.root.parent / "copy")
+    node = state.running.processes[0]
+    thief = replace(node, pid=6, environment={**node.environment, KEYSTORE: str(copy)})
+    return with_processes(state, thief, node, replace(node, pid=9))
+
+
 def _unseen(state: RuntimeState, _: Bench) -> RuntimeState:
     unseen = UnseenProcess(9, ("/sbin/init",), "Permission denied", uses_ros=False)
     return replace(state, running=RunningProcesses(unseen=(unseen,)))
@@ -283,6 +291,7 @@ CASES: dict[str, Change] = {
     "runtime.process-not-connected": _not_connected,
     "runtime.process-lost-memory": changed(0, lost_memory=True),
     "runtime.process-other-folder": _from_an_older_copy,
+    "runtime.process-copied-enclave": _from_a_copy,
     "runtime.process-local-time": lambda state, bench: _at_the_end(state, bench, TZ="Asia/Tokyo"),
     "runtime.process-files-replaceable": _others_can_write,
     "runtime.process-key-readable": _others_can_read_the_key,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -172,9 +171,20 @@ def test_found(expected: str, sound_one: RuntimeState, bench: Bench) -> None:
 def test_the_same_files_in_another_folder_are_no_other_files(
     sound_one: RuntimeState, bench: Bench
 ) -> None:
-    """Its twin with another governance is among the cases."""
-    copy = shutil.copytree(sound_one.environment[KEYSTORE], bench.root.parent / "copy")
-    assert not ids(running(0, **{KEYSTORE: str(copy)})(sound_one, bench))
+    """Its twin with another governance is among the cases.
+
+    If the enclave runs from both folders, the process from the copy is found.
+    """
+    expected = "runtime.process-copied-enclave"
+    both = seen(CASES[expected](sound_one, bench))
+    thief, node = both.running.processes[:2]
+    copy, own = (process.environment[KEYSTORE] for process in (thief, node))
+    (found,) = (each for each in runtime_findings(both) if each.id == expected)
+    assert found.subject == thief.label
+    assert found.text == f"it runs in /base from '{copy}', and {node.label} from '{own}'"
+    counts = security_counts_text(both.running)
+    assert counts.endswith(f"3 secured, 0 open; secured from '{own}' (2) and '{copy}' (1)")
+    assert not ids(running(0, **{KEYSTORE: copy})(sound_one, bench))
 
 
 def test_nothing_on_zenoh_with_a_session_file(sound_one: RuntimeState, bench: Bench) -> None:

@@ -901,7 +901,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     export = robot.folder / "robot/export"
     start = f"cd /opt && sros run {export} /late -- /opt/late --ros-args"
     named = "process 7 (late) runs open, and has the name of /late: stop it, and, if it is this"
-    assert f"{named} node, start it in its enclave: {start}. Otherwise, nobody would" in said
+    assert f"{named} node, start it in its enclave: {start}. While it runs open, the" in said
     assert "sros does not know the enclave" not in said
     a_unit_that_started_after_the_watch(robot, late)
     other = replace(late, pid=8, command=("/opt/more", "--ros-args"))
@@ -1293,7 +1293,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert (
         "not checked (accepted): every process was started in its enclave: true for 2 "
         "enclaves; process 9 (?) (/proc hides it), process 10 (init) (Permission denied) may be "
-        "nodes, but cannot be examined\n"
+        "nodes, but cannot be examined: they may run open, or with a copied key\n"
     ) in ended.out
     assert "closed, except for the claims that were not checked" in ended.err
     robot.unseen, rogue = (), robot.folder / "rogue.xml"
