@@ -346,7 +346,8 @@ def merge_policies(
 
     Returns:
         The ``document`` (bytes) for the folder of ``policy``, whose includes it keeps; the rights
-        that were ``added``; and ``notes``, for instance on a DENY that wins.
+        that were ``added``; all ``rights``; the ``contradictions`` between an ALLOW and a DENY,
+        which wins; and ``notes``, for instance on a DENY that wins.
 
     Raises:
         PolicyError: (or another `DocumentError`) A policy cannot be read, or rights cannot be added
@@ -860,7 +861,8 @@ def check(
         strict: Include the weaknesses that a keystore's template accepts.
         distribution: The ROS 2 distribution, such as "lyrical", whose nodes and DDS the findings
             are for; by default the latest for nodes in policies, and the distributions in the
-            keystore's settings.
+            keystore's settings.  In place of one that is not supported any more, such as "foxy",
+            the next supported one counts, and no finding says so.
         domain: The ROS domain id that the enclaves have to join.
         now: The time at which validities are checked; the current time by default.
         zone: The time zone of the robot, in which some vendors read dates.
@@ -941,7 +943,8 @@ def check_requirements(
         vendor: The only DDS vendor to decide for, or "zenoh"; every tested vendor and Zenoh by
             default.
         distribution: The ROS 2 distribution, such as "lyrical", whose DDS decides; without
-            ``vendor``, all that it ships.
+            ``vendor``, all that it ships.  In place of one that is not supported any more, such as
+            "foxy", the next supported one decides, and no finding says so.
         domain: The only ROS domain id to decide for; by default one of each group of domains that
             the keystore's documents treat alike.
         now: The time at which permissions have to be valid; the current time by default.
