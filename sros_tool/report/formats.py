@@ -434,7 +434,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
 
 
 def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
-    """Return a Markdown table with the senders and receivers of each name.
+    """Return a Markdown table with the protection, the senders and the receivers of each name.
 
     Without ``everything``, names are left out if the only rights to them are rights that every node
     needs.
@@ -458,8 +458,10 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
     spellings = {known[row].spelling for row in rows}
     for (kind, name), ends in rows.items():
         stated = known[kind, name]
-        moves = stated.spelling in _MOVING
-        cells = [f"{KIND_NAMES[kind]} {code(name)}" + f" ({stated.spelling})" * moves]
+        level = stated.protection.level
+        remarks: list[str] = [stated.spelling] if stated.spelling in _MOVING else []
+        remarks += [] if level is WireLevel.UNKNOWN else [LEVEL_NAMES[level]]
+        cells = [f"{KIND_NAMES[kind]} {code(name)}" + f" ({'; '.join(remarks)})" * bool(remarks)]
         controls = stated.protection.write_control, stated.protection.read_control
         sides = Lack.SENDER, Lack.RECEIVER
         for end, lack, controlled, sends in zip(ends, sides, controls, (True, False), strict=True):

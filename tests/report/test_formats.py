@@ -15,7 +15,7 @@ from sros_tool.report.layout import scenes_of
 from sros_tool.report.picture import Lack
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
 from tests.support.children import importing, python, run
-from tests.support.harness import copy_of, policy_text, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import some
 
 pytest_plugins = ["tests.report.browsing"]
@@ -134,16 +134,18 @@ def test_no_cell_of_the_table_is_empty_where_a_denial_alone_names_something(tmp_
     assert "| topic `/arm/*` | no enclave here | no enclave here, `/z` is denied |" in table
 
 
-def test_a_table_says_which_names_move_with_the_namespace(tmp_path: Path) -> None:
+def test_a_table_says_which_names_move_or_are_protected(tmp_path: Path) -> None:
     two = sros("view", tmp_path / "p.xml", tmp_path / "q.xml", "--format", "markdown")
     assert two.status == 2 and "For several policies of a robot or package, name their" in two.err
     relative = '<topics publish="ALLOW"><topic>width</topic><topic>/tf</topic></topics>'
     absolute = '<topics subscribe="ALLOW"><topic>/width</topic></topics>'
     action = '<actions execute="ALLOW"><action>grasp</action></actions>'
+    protected = publish('x<?sros protect="sign"?>', '/y<?sros protect="encrypt"?>')
     legend = "absolute names stay.\n"
     for rights, rows, end in (
         ({"/a": relative, "/b": absolute}, ("`/width` (relative for some nodes) |",), legend),
         ({"/a": relative + action}, ("`/width` (relative) |", "`/grasp` (rel", "`/tf` |"), legend),
+        ({"/a": protected}, ("`/x` (relative; signed, readable) |", "`/y` (encrypted) |"), legend),
         ({"/a": absolute}, (), "All names are absolute: the namespaces of"),
     ):
         (tmp_path / "p.xml").write_text(policy_text(rights))

@@ -779,9 +779,8 @@ def test_a_phone_shows_first_who_may_drive_and_what_everybody_may_do(
     path = tmp_path / "open.html"
     sros("view", open_keystores["some names"], "-o", path).ok()
     shown = sros("view", open_keystores["some names"], "--format", "markdown").out
-    assert (
-        "| topic `/cmd_vel` | everybody with an identity, `/mobile_robot/velocity_mux` |" in shown
-    )
+    who = "everybody with an identity, `/mobile_robot/velocity_mux`"
+    assert f"| topic `/cmd_vel` (encrypted) | {who} |" in shown
     with opened(browser, path, "phone") as page:
         # What needs a look is unfolded; a search unfolds all, and paper has all.
         rows = page.locator("#names tbody tr:visible")
