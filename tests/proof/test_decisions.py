@@ -820,7 +820,7 @@ def test_who_may_what_counts_processes_without_an_identity(tmp_path: Path) -> No
     reach = sros("explain", keystore, "--reach", "/a").ok()
     assert "their influence is not followed" in reach.err and refuse in reach.err
     table = sros("view", keystore, "--format", "markdown").ok().out
-    assert "| topic `/x` | everybody, even without an identity, `/a` |" in table
+    assert "| topic `/x` (not protected) | everybody, even without an identity, `/a` |" in table
 
 
 WEAK = "a template that signs, and encrypts nothing"
