@@ -638,6 +638,16 @@ def _edit_text(violation: Violation, of_fleet: bool) -> str:
     if moved:
         effect += f"; there, a name with one / at its beginning is below {space}"
     outside = sorted(name for name in enclaves if not name.startswith(f"{space}/"))
+    stays = space and not any(name.startswith(f"{space}/") for name in (*enclaves, *listed))
+    if of_fleet and stays and isinstance(requirement, Only):
+        patterns = {_with_placeholder(name, space[1:]) for name in outside}
+        if patterns.isdisjoint(outside):
+            quoted = [f'"/{name}"' for name in sorted(patterns)]
+            return (
+                "Change the policy at the named lines; or, to allow this on each robot, list "
+                f"{first_few(quoted, _MOST_SHOWN)} in a copy of the requirement, and write "
+                f"{{namespace}}/ before its names{effect}."
+            )
     if outside:
         effect += "; if a package ships the file, write this only into a copy"
     written = {
@@ -650,6 +660,11 @@ def _edit_text(violation: Violation, of_fleet: bool) -> str:
         f"{first_few(quoted, _MOST_SHOWN)} to `{key}` of the requirement at "
         f"{place.file}:{place.line}{effect}."
     )
+
+
+def _with_placeholder(enclave: str, name: str) -> str:
+    """Return an enclave's name with ``{robot}`` in place of each part that is a robot's name."""
+    return "/".join("{robot}" if part == name else part for part in enclave.split("/"))
 
 
 def _titled_demand(requirement: Requirement) -> str:

@@ -201,6 +201,20 @@ def test_a_finding_for_all_robots_is_shown_once(folder: Path) -> None:
         'policy. In a copy of the requirement, list "//mux/{robot}", and write {namespace}/ before '
         "its names." in ended.out
     )
+    panel = '<enclave path="/op/{robot}/ui"><profiles><profile ns="{namespace}" node="ui">'
+    panel += publish("{namespace}/light") + "</profile></profiles></enclave></enclaves>"
+    (folder / "panel.xml").write_text(POLICY.replace("</enclaves>", panel))
+    of_panel = ("check", "panel.xml", *of_policy[2:], *words[2:], "--requirements")
+    every = [word for robot in ("r1", "r2", "r3") for word in ("--namespace", f"/{robot}")]
+    table = '[[only]]\npublish = ["{}light"]\nenclaves = ["//op/{}ui"]\n'
+    (folder / "light.toml").write_text(table.format("", ""))
+    ended = sros(*of_panel, "light.toml", *every, cwd=folder)
+    assert (
+        'to allow this on each robot, list "//op/{robot}/ui" in a copy of the requirement, and '
+        "write {namespace}/ before its names." in ended.out
+    )
+    (folder / "light.toml").write_text(table.format("{namespace}/", "{robot}/"))
+    assert "requirement.violated" not in sros(*of_panel, "light.toml", *every, cwd=folder).out
     of_one = sros("check", "robot.xml", "--requirements", "r.toml", cwd=folder)
     assert "stands for" in of_one.err or "Without a fleet" in of_one.err
     keys = ("-k", "ks", "-p", "robot.xml", "--fleet", "fleet.toml")
