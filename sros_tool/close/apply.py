@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence, Set
+from contextlib import suppress
 from datetime import timedelta
 from itertools import chain
 from pathlib import Path
@@ -193,6 +194,8 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     for path in drop_ins:
         if not dry_run:
             remove_file(path)
+            with suppress(OSError):  # the unit has other drop-ins
+                path.parent.rmdir()
         robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
     # A unit without a drop-in still runs closed if an earlier --undo was killed before the restart.
     units |= {

@@ -566,8 +566,10 @@ def test_a_robot_is_closed_proved_and_opened_again(
     assert "seen neither" not in proved
     policy.write_text(signed)
     refuse_undo_of_others(robot)
+    (other := robot.folder / "systemd/listener.service.d/other.conf").touch()
     undone = robot.close("--undo")
-    assert [*robot.folder.glob("systemd/*.d/*")] == []
+    assert [*robot.folder.glob("systemd/*.d/*")] == [other]
+    assert [*robot.folder.glob("systemd/*.d")] == [other.parent], "without empty folders"
     assert robot.restarts[3:] == ["daemon-reload", "restart listener.service talker.service"]
     assert undone.err.count("removed ") == 2
     robot.close("--undo")
