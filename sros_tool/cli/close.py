@@ -219,9 +219,12 @@ def close(
     if apply and not dry_run:
         check_may_restart(robot, robot.processes.units, "--apply")
     accepted = set(Acceptance) if partial else {Acceptance(word) for word in accept}
+    unexamined = ""
     with nullcontext() if dry_run or prove else robot.locked():
         if undo:
-            closed = open_again(robot, dry_run=dry_run)
+            closed, unexamined = open_again(robot, dry_run=dry_run)
+            if unexamined and (dry_run or as_json):
+                robot.shell.say(unexamined)
         elif prove:
             closed = prove_closed(robot)
         else:
@@ -232,7 +235,7 @@ def close(
     if as_json:
         print_json(closed)
     elif undo:
-        _show_undone(robot, closed)
+        _show_undone(robot, closed, unexamined)
     elif closed.problems or not dry_run:
         if not (apply or prove):
             _show(robot, closed)
@@ -552,23 +555,26 @@ def _advice_without_security(robot: LocalRobot, closed: CloseState) -> str:
     )
 
 
-def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
-    """Print what still has to be done until the robot is open."""
+def _show_undone(robot: LocalRobot, closed: CloseState, unexamined: str) -> None:
+    """Print what still has to be done until the robot is open.
+
+    ``unexamined`` are sentences on processes that sros cannot examine; "" without any.
+    """
     for problem in closed.problems:
         echo(problem)
     if closed.dry_run:
         return
+    end = f". {unexamined}" if unexamined else ""
     if closed.problems:
         ask = f"run sros close {shlex.quote(str(robot.folder))} --undo again"
-        echo(f"the robot is not open yet; next: do what each line says, and {ask}", err=True)
+        echo(f"the robot is not open yet; next: do what each line says, and {ask}{end}", err=True)
     else:
         more = ""
         if other_machines := closed.observed.not_here:
             more = f"; on other machines, also start the processes of {enumerated(other_machines)} "
             more += "without sros run"
-        echo(
-            f"the robot is open: sros sees no process in an enclave of this folder{more}", err=True
-        )
+        is_open = f"the robot is open{', as far as sros can see' if unexamined else ''}"
+        echo(f"{is_open}: sros sees no process in an enclave of this folder{more}{end}", err=True)
 
 
 def _state_text(closed: CloseState, *, apply: bool) -> str:

@@ -180,8 +180,9 @@ def _remember_new_units(robot: LocalRobot, observed: ObservedProcesses) -> None:
         robot.write_processes(robot.processes._replace(processes=processes))
 
 
-def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
-    """Remove the drop-ins of this folder, and restart their units; return the new state.
+def undo(robot: LocalRobot, *, dry_run: bool) -> tuple[CloseState, str]:
+    """Remove the drop-ins of this folder, and restart their units; return the new state, and
+    sentences on processes that cannot be examined.
 
     Says what is left to do by hand.
     """
@@ -249,7 +250,7 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     # Without the list of observed processes, "no process runs" would be a guess.
     if robot.observed and not (dry_run or problems or runs or state.observed.unknown):
         problems = ["no process of the robot runs, open or secured: start its processes open"]
-    return state._replace(problems=problems)
+    return state._replace(problems=problems), remaining.unexamined_text
 
 
 def _processes_not_open(running: RunningRobot, started: Sequence[ClosedProcess]) -> Iterator[str]:
@@ -415,18 +416,22 @@ class _RemainingProcesses:
                     "not of this folder, and open processes do not hear it: stop it, or restart it "
                     "open"
                 )
-        unseen_processes = running.processes.unseen
-        for unseen in unseen_processes:
+        for unseen in running.processes.unseen:
             if unseen.uses_ros:
                 yield (
                     f"{unseen.label} uses ROS 2, and cannot be examined ({unseen.why}): if it "
                     "runs secured, stop it, or restart it open"
                 )
-        if running.processes.hidden or any(not unseen.uses_ros for unseen in unseen_processes):
-            why = "some processes cannot be examined"
-            by_root = running.processes.is_run_by_root
-            remedy = f". {ROOT_IS_NOT_ENOUGH}" if by_root else ": run this command as root"
-            self._robot.shell.say(f"{why}{remedy}")
+
+    @property
+    def unexamined_text(self) -> str:
+        """Sentences on processes that sros cannot examine, and that may use ROS 2; "" if none."""
+        running = self._running.processes
+        if not (running.hidden or any(not unseen.uses_ros for unseen in running.unseen)):
+            return ""
+        if running.is_run_by_root:
+            return f"Some processes cannot be examined. {ROOT_IS_NOT_ENOUGH}"
+        return "Some processes cannot be examined: as root, this command examines them, too"
 
 
 def _with_unit_to_change(command: str, unit: str) -> str:

@@ -780,15 +780,19 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     listener["command"] += ["--ros-args", "-r", "__node:=hearer"]
     processes.write_text(json.dumps(known))
     assert "/listener open: cd /opt && /opt/run listener --ro" in robot.close("--undo").err
-    assert "\nsome processes cannot be examined: run this command as root\n" in undone.err
-    assert "the robot is open: " in undone.err
+    cannot = "Some processes cannot be examined"
+    assert undone.err.endswith(
+        "\nthe robot is open, as far as sros can see: sros sees no process in an enclave of this "
+        f"folder. {cannot}: as root, this command examines them, too\n"
+    )
+    assert f"\n{cannot}: as root" in robot.close("--undo", "--dry-run").err
     looked = replace(robot.look(None, datetime.now(UTC)), is_run_by_root=True)
     robot.more, robot.unseen = (), ()
     undone = robot.close("--undo", status=1)
     assert undone.out.startswith("no process of the robot runs, open or secured: start its proc")
     monkeypatch.setattr(ProcessTable, "look", lambda _table, _now: looked)
     undone = robot.close("--undo")
-    assert "\nsome processes cannot be examined. Being root is not enough here: " in undone.err
+    assert f"in an enclave of this folder. {cannot}. Being root is not" in undone.err
 
 
 def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
