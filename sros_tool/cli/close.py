@@ -280,9 +280,17 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     for process_text in closed.not_observed:
         echo(f"  not observed before: {process_text}; if it does not belong to the robot, stop it")
     for name in closed.new:
-        why = "has ended" if name in closed.observed.ended else "new"
         start = closed.observed.command_of_new_process(robot.export.absolute(), name)
-        echo(f"  {name}: {why}, start it with: {start}")
+        if name in closed.observed.ended:
+            echo(f"  {name}: has ended, start it with: {start}")
+            continue
+        if any(f" has the name of {name}: " in problem for problem in closed.problems):
+            echo(f"  {name}: new; a process with its name runs open (see below)")
+            continue
+        echo(
+            f"  {name}: new, start it with: {start} (if it belongs to another machine: "
+            f"`{robot.close_command} --elsewhere {name}`)"
+        )
     if closed.secured and {*closed.new}.difference(closed.observed.ended):
         echo(
             "  if a systemd unit starts a new process, start the unit open, and run "

@@ -898,6 +898,8 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     (robot.folder / "robot/requirements.toml").unlink()
     ended = robot.close()
     assert "  /late: new, start it with: sros run " in ended.out
+    there = "(if it belongs to another machine: `sros close robot --elsewhere /late`)\n"
+    assert f"/late -- COMMAND {there}" in ended.out
     assert "  if a systemd unit starts a new process, start the unit open, and run " in ended.out
     robot.more = (late,)
     said = robot.close(status=1).out
@@ -908,6 +910,8 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     start = f"cd /opt && sros run {export} /late -- /opt/late --ros-args"
     named = "process 7 (late) runs open, and has the name of /late: stop it, and, if it is this"
     assert f"{named} node, start it in its enclave: {start}. While it runs open, the" in said
+    assert "/late: new; a process with its name runs open (see below)\n" in said
+    assert "COMMAND" not in said, "there is one command"
     assert "sros does not know the enclave" not in said
     a_unit_that_started_after_the_watch(robot, late)
     other = replace(late, pid=8, command=("/opt/more", "--ros-args"))
