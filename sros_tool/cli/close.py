@@ -8,6 +8,7 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, redirect_stderr, redirect_stdout
+from datetime import datetime, timedelta
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,11 +29,9 @@ from sros_tool.close.acceptance import IN_PREPARATION, IN_PROOF, Acceptance, Acc
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo
 from sros_tool.validity import iso
-from sros_tool.wording import counted, enumerated
+from sros_tool.wording import counted, enumerated, first_few
 
 if TYPE_CHECKING:
-    from datetime import datetime
-
     from sros_tool.close.processes import ClosedProcess
     from sros_tool.close.robot import LocalRobot
     from sros_tool.close.state import CloseState
@@ -671,7 +670,25 @@ def _validity_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
             keystore = OpenedKeystore(robot.keystore)
             by_name = enclaves_renewed_by_name(keystore, keystore.template, closed.expires_soon)
         advice = f"renew them now: {renewal_command(closed.folder / 'keystore', *by_name)}"
-    return [f"the files are valid until {iso(closed.valid_until)}; {advice}"]
+    first = f"{iso(closed.valid_until)}{_first_to_expire_clause(robot, closed.valid_until)}"
+    return [f"the files are valid until {first}; {advice}"]
+
+
+def _first_to_expire_clause(robot: LocalRobot, first: datetime) -> str:
+    """Return which enclaves expire at about the ``first`` moment, if others expire much later.
+
+    Otherwise, returns "".
+    """
+    from sros_tool.close.robot import MOST_NAMES
+    from sros_tool.close.state import expiries_of_export
+
+    ends = {name: end for name, end in expiries_of_export(robot).items() if end}
+    later = [end for end in ends.values() if end - first > _MUCH_LATER]
+    if not later:
+        return ""
+    names = [name for name, end in ends.items() if end not in later]
+    others = f"{'the others' if later[1:] else 'the other one'} until {iso(min(later))}"
+    return f" (those of {first_few(names, MOST_NAMES)}; {others})"
 
 
 def _shared_start_text(processes: Sequence[ClosedProcess]) -> str:
@@ -694,6 +711,7 @@ def _pids_text(pids: Sequence[int]) -> str:
 
 
 _MOST_DENIED = 4
+_MUCH_LATER = timedelta(days=7)
 _ANSWERS = {True: "yes", False: "no", None: "not checked"}
 _NOT_CURRENT = "with earlier files or other settings"
 _ACCEPT_ADVICE = "accept unchecked claims with --accept, or "

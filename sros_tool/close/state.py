@@ -846,8 +846,13 @@ def _valid_until(robot: LocalRobot) -> datetime | None:
     """Return when the first enclave of the export expires; None if one cannot be read."""
     if not robot.export.exists():
         return None
-    moments = _expiries(robot, robot.export, list_enclaves(robot.export)).values()
+    moments = expiries_of_export(robot).values()
     return min(filter(None, moments), default=None) if all(moments) else None
+
+
+def expiries_of_export(robot: LocalRobot) -> Mapping[str, datetime | None]:
+    """Map the enclaves of the export to their expiry; None for an enclave that cannot be read."""
+    return _expiries(robot, robot.export, list_enclaves(robot.export))
 
 
 def _expiries(robot: LocalRobot, root: Path, names: Iterable[str]) -> Mapping[str, datetime | None]:

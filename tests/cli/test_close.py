@@ -2319,6 +2319,14 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
     assert (
         f"their rights until the files expire: /operator/look ({iso(until)}); to end this" in said
     )
+    # The line names an enclave that expires long before the others.
+    sros("distribute_key", keystore, "/operator/look", tmp_path / "export", "--force").ok()
+    look = state_at(moment := datetime.now(UTC))
+    (line,) = close._validity_lines(robot_at(moment), look)
+    others = f"(those of /operator/look; the others until {iso(now.valid_until)}); have"
+    assert look.valid_until and line.startswith(
+        f"the files are valid until {iso(look.valid_until)} {others}"
+    )
     (tmp_path / "export/enclaves/b/permissions.p7s").write_bytes(b"damaged")
     assert state_at(datetime.now(UTC)).valid_until is None, "nobody knows until when /b works"
 
