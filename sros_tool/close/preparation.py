@@ -49,6 +49,7 @@ from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import OFFERING_RIGHT
 from sros_tool.policy.rights import Rules, policy_rights
 from sros_tool.proof.requirements import RightsRequirement, read_requirements
 from sros_tool.runtime.environment import RMW_ZENOH, node_argument, remapping_rules
@@ -361,6 +362,9 @@ def _lost_protection(robot: LocalRobot) -> Iterator[str]:
     Then nobody names it any more, or nobody has the required right to it, and an enclave that had
     it has a new right of this kind.  A new wildcard in place of the name, in the same enclaves, is
     no other name.
+
+    If there is such a requirement, requirements on using a name that nobody offers any more follow:
+    the same change gave up this name.
     """
     if not robot.keystore.exists():
         return
@@ -377,18 +381,26 @@ def _lost_protection(robot: LocalRobot) -> Iterator[str]:
         for right in given_up
         if (right.right, right.name) not in held and (right.enclave, right.right) in gaining
     }
-    for requirement in read_requirements(robot.requirements):
-        if not isinstance(requirement, RightsRequirement):
-            continue
-        required = {(right, name) for right, names in requirement.rights for name in names}
+    required_rights = [
+        (each.source.line, {(right, name) for right, names in each.rights for name in names})
+        for each in read_requirements(robot.requirements)
+        if isinstance(each, RightsRequirement)
+    ]
+    if any(pair in moved or pair[1] in gone for _, pairs in required_rights for pair in pairs):
+        uses = {offering: using for using, offering in OFFERING_RIGHT.items()}
+        moved |= {(uses[right], name) for right, name in moved if right in uses}
+    for line, required in required_rights:
         names = gone & {name for _, name in required}
         if lost := sorted(names | {name for _, name in moved & required}):
-            uses = "name" if names else "use as before"
+            why = "which the policy does not name any more"
+            if not names:
+                why = f"but the policy now uses {'other names' if lost[1:] else 'another name'} "
+                why += f"in {'their' if lost[1:] else 'its'} place"
             yield (
-                f"{robot.requirements}:{requirement.source.line} protects {enumerated(lost)}, "
-                f"which the policy does not {uses} any more; {_NOT_SIGNED}. If the policy "
-                "renamed a name, also rename it in the requirement. If nobody needs a name any "
-                "more, remove it there (or accept this with --accept requirements)"
+                f"{robot.requirements}:{line} protects {enumerated(lost)}, {why}; "
+                f"{_NOT_SIGNED}. If the policy renamed a name, also rename it in the "
+                "requirement. If nobody needs a name any more, remove it there (or accept this "
+                "with --accept requirements)"
             )
 
 

@@ -2204,7 +2204,8 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
     sros("create_keystore", robot.keystore).ok()
     sros("generate_artifacts", "-k", robot.keystore, "-p", robot.policy).ok()
     assert preparation._run_step(robot, guard, accepted=set()) == ("done", []), "as before"
-    robot.requirements.write_text(needed.replace("gone", "x"))
+    readers = '[[only]]\nsubscribe = ["/x"]\nenclaves = ["/b", "/r"]\n'
+    robot.requirements.write_text(needed.replace("gone", "x") + readers)
     for groups, other, lost in (
         (publish("*"), "", False),  # a wildcard in place of the name
         (publish("y"), publish("*"), True),  # a wildcard that another enclave has
@@ -2215,9 +2216,12 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
         robot.policy.write_text(policy_text({"/a": groups, "/b": other, "/r": reads}))
         state_of_step, problems = preparation._run_step(robot, guard, accepted=set())
         assert state_of_step == ("findings" if lost else "done"), groups
-        use = "use as before" if other == subscribe("x") else "name"
-        said_now = f"toml:1 protects /x, which the policy does not {use} any more; nothing was"
-        assert [said_now in problem for problem in problems] == [True] * lost
+        why = "which the policy does not name any more"
+        if other == subscribe("x"):
+            why = "but the policy now uses another name in its place"
+        places = [problem.partition("requirements.")[2] for problem in problems]
+        said_now = [f"toml:{line} protects /x, {why}; nothing was signed" for line in (1, 4)]
+        assert [place.partition(". If")[0] for place in places] == said_now * lost
     # A later name gets no requirement by itself, unlike those of the first policy.
     lost_policy = robot.policy.read_text()
     one_end = {"/a": publish("x", "z"), "/r": reader}
