@@ -2446,7 +2446,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert there in commands.read_text()
     robot.more = (replace(robot.process("/listener", is_secured=False), pid=19),)
     back = "process 19 (run) runs open, and has the command of /listener, which belongs to another "
-    back += "machine: stop it, or bring the enclave back: sros close robot --here /listener. Otherw"
+    back += "machine: stop it, or bring the enclave back: sros close robot --here /listener. While "
     assert f"  {back}" in (said := robot.close(status=1).out)
     assert "sros does not know" not in said
     robot.more = ()
