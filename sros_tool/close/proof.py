@@ -175,9 +175,15 @@ def _proof_of_files(
             _, value = robot.shell.read_json((*robot.export_words(), "--dry-run", "--json"))
             changes = [change["path"] for change in value["changes"]]
         except UnavailableError as error:
-            holds, reason = None, f"they cannot be compared with the keystore: {error}"
+            holds, reason = (
+                None,
+                f"they cannot be compared with the keystore: {f'{error}'.removesuffix('.')}",
+            )
         except SrosError as error:  # for example, an older revocation list
-            holds, reason = False, f"the keystore does not export them: {error}"
+            holds, reason = (
+                False,
+                f"the keystore does not export them: {f'{error}'.removesuffix('.')}",
+            )
         else:
             if outside := robot.enclaves_outside_policy():
                 reason = f"the keystore has {first_few(outside, MOST_NAMES)}, and the policy does "
@@ -440,7 +446,8 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
     if not hears:
         why = "this proves nothing, because the observer in its enclave does not see the robot now"
         return Proof(SILENCE, None, why)
-    reason = f"the listener saw {nodes_text(before.nodes)} before, and sees none now"
+    number = nodes_text(before.nodes)
+    reason = f"the listener saw {number} before (without removed ones), and sees none now"
     return Proof(SILENCE, True, reason)
 
 

@@ -524,7 +524,8 @@ def test_a_robot_is_closed_proved_and_opened_again(
         "(types are not compared)",
         "  sros cannot see whether two nodes hear each other: look at what the nodes receive now, "
         "and restart a node that receives nothing",
-        "yes: an open listener finds nothing: the listener saw 2 nodes before, and sees none now",
+        "yes: an open listener finds nothing: the listener saw 2 nodes before (without removed "
+        "ones), and sees none now",
     ]
     assert re.search(
         r"\nthe robot is closed\n  the files are valid until 20.*Z; have them renewed before then "
