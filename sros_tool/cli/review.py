@@ -31,7 +31,8 @@ from sros_tool.wording import counted
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.proof.repository import Repository
-    from sros_tool.proof.review import AccessChange, Review, ReviewRequest, ReviewStep
+    from sros_tool.proof.review import AccessChange, Review, ReviewStep
+    from sros_tool.proof.review_request import ReviewRequest
 
     _PathsType = click.ParamType[tuple[str, ...]]
 else:  # generic from click 8.2 on
@@ -251,8 +252,8 @@ def review(
     from sros_tool.policy.remapping import parse_remapping_of_names
     from sros_tool.proof.commit_files import checked_path
     from sros_tool.proof.repository import Repository
-    from sros_tool.proof.review import ReviewRequest
     from sros_tool.proof.review import review as review_change
+    from sros_tool.proof.review_request import ReviewRequest
 
     if not base:
         raise UsageError(

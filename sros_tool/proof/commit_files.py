@@ -206,6 +206,12 @@ class CommitFiles:
         """Return the tree entry at a path of the commit; None if the path does not exist."""
         return self.repository.find(self.commit, path)
 
+    def entries(self, *, unlike: CommitFiles | None = None) -> Iterator[tuple[str, TreeEntry]]:
+        """Yield paths and entries (`walk`), without those that are the same in ``unlike``."""
+        before = unlike.repository.tree(unlike.commit) if unlike else ""
+        tree = self.repository.tree(self.commit)
+        return walk(self.repository, tree, maximum=_MOST_ENTRIES, other=before)
+
     def write_file(self, path: str) -> Path | None:
         """Write the file at a path of the commit; return its new path, or None for a missing path.
 

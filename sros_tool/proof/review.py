@@ -8,11 +8,9 @@ what was not compared.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, tzinfo
 from functools import cache, cached_property, partial
 from itertools import chain
 from pathlib import Path
@@ -33,28 +31,14 @@ from sros_tool.checks.requirements import DROPPED
 from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
-from sros_tool.files import policies_dir
 from sros_tool.fleet.changes import FleetChange, delivery_place, fleet_changes
 from sros_tool.fleet.expansion import FleetPolicy, fleet_with_enclaves, read_policy_for
 from sros_tool.fleet.fleet_file import ROBOT_VARIABLE, read_connection_settings, read_fleet
 from sros_tool.fleet.robots import Fleet, Robot, robot_of
 from sros_tool.folders import Folder
-from sros_tool.keystore.expiry import ExpiryCheck, Threshold, due_enclaves
+from sros_tool.keystore.expiry import ExpiryCheck, due_enclaves
 from sros_tool.keystore.fleet import load_fleet
-from sros_tool.keystore.layout import (
-    CRL,
-    ENCLAVES,
-    FLEET,
-    KEY_FILE,
-    OPTIONAL_FILES,
-    PUBLIC,
-    REQUIRED_FILES,
-    ROLES,
-    SETTINGS,
-    ZENOH_FILES,
-    ca_certificate_path,
-    is_keystore,
-)
+from sros_tool.keystore.layout import FLEET, KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import (
     RightsSource,
@@ -65,21 +49,7 @@ from sros_tool.keystore.rights import (
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
-from sros_tool.policy.remapping import Remapping
-from sros_tool.policy.rights import policy_rights
-from sros_tool.proof.commit_files import (
-    ATTRIBUTES_FILE,
-    EXPORT_IGNORE,
-    CommitFiles,
-    converting_patterns,
-    files_including,
-    files_used_whole,
-    have_same_root,
-    is_whole_policy,
-    may_be_policy,
-    may_include_files,
-    may_match,
-)
+from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.escapes import MOST_NAMESPACES
 from sros_tool.proof.findings import (
     common_namespaces,
@@ -87,8 +57,8 @@ from sros_tool.proof.findings import (
     unused_remapping_findings,
 )
 from sros_tool.proof.growth import Growth, compare_access
-from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
-from sros_tool.proof.requirements import KINDS, FleetSource, Requirement, read_requirements
+from sros_tool.proof.requirements import FleetSource, Requirement, read_requirements
+from sros_tool.proof.review_request import ReviewRequest
 from sros_tool.proof.reviewed_requirements import (
     ONLY_THE_CHANGE,
     RequirementFiles,
@@ -97,86 +67,19 @@ from sros_tool.proof.reviewed_requirements import (
 )
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
 from sros_tool.proof.system import load_system, policy_system
+from sros_tool.proof.unreviewed import UnreviewedFiles
 from sros_tool.values import Words
-from sros_tool.wording import enumerated, first_few
+from sros_tool.wording import enumerated
 
 Value = TypeVar("Value")
 _HEAD, _BASE = "HEAD", "BASE"
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
-_MOST_ENTRIES = 200_000
-_MOST_CHANGED = 20_000
-_MOST_BYTES = 1024 * 1024 * 1024
-_MAX_SEARCHED_BYTES = 32 * 1024 * 1024
-"""Size in bytes of the largest changed file that is searched for a policy.
-
-No policy is larger than that.
-"""
-_ARCHIVE_SIGNATURES = (
-    b"\x1f\x8b",
-    b"PK\x03\x04",
-    b"\xfd7zXZ",
-    b"BZh",
-    b"\x28\xb5\x2f\xfd",
-    b"7z\xbc\xaf",
-)
-"""First bytes of files of gzip, ZIP, xz, bzip2, Zstandard and 7z."""
-_LONGEST_TARGET_SHOWN = 200  # characters that are shown of a link's target
-_NOT_USED_TEXT = (
-    "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
-    "with"
-)
 _BOTH_NAMES_REMEDY = "give --policy the folder that has the file under its old and its new name"
-_PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[nr])+[\w+/]")
-"""A private key in PEM; a text that only mentions the first line does not match."""
 _UNSIGNED_POLICY_IDS = tuple(
     kind.id for kind in (STALE, LESS_PROTECTED, NOT_IN_POLICY, NOT_IN_KEYSTORE, NOT_IN_EXPORT)
 )
 """Ids of findings which say that a keystore is not signed for the policies."""
-_TEMPLATE_TABLES = ("authorities", "certificates", "permissions", "protection")
-_SETTINGS_TABLE = re.compile(
-    rf"^[ \t]*\[+(?:{'|'.join((*_TEMPLATE_TABLES, *KINDS, 'robots'))})\b".encode(), re.MULTILINE
-)
-"""A table of a keystore template, of requirements or of a fleet file."""
-_LARGEST_SETTINGS = 1024 * 1024
-_VARIABLE_FOLDERS = frozenset({"group_vars", "host_vars"})
-"""Folders next to an inventory from which only Ansible reads variables."""
-_PRIVATE_KEY_FOUND = (
-    "has a private key, which everybody who can read the repository has now: replace it, because "
-    "the history of the repository keeps it"
-)
 _OK, _FOUND, _UNDECIDED = 0, 1, 2
-
-
-@dataclass(frozen=True, slots=True)
-class ReviewRequest:
-    """The input of a review; paths are relative to the top of the repository.
-
-    ``head`` is the commit to review, ``base`` the commit to compare with ("": none). With
-    ``namespaces`` and ``remaps``, the requirements are read for these namespaces and names.  With
-    ``allow_new_access``, new access and unreviewed policies are shown but do not make the review
-    fail.  With ``allow_dropped_requirements``, requirements that HEAD drops or weakens do not make
-    the review fail. The review fails if an enclave expires within ``renew_within``.  ``left_out``
-    are files and folders of policies that are not reviewed.  ``template`` is the keystore template
-    whose protection is assumed for the policies: a path, the name of a shipped template, or "".
-    ``at`` is the time of the review, and ``zone`` the time zone of the robots.
-    """
-
-    repository: Repository
-    base: str
-    head: str
-    policies: tuple[str, ...]
-    requirements: tuple[str, ...]
-    namespaces: tuple[str, ...]
-    remaps: tuple[Remapping, ...]
-    fleet: str
-    keystores: tuple[str, ...]
-    allow_new_access: bool
-    allow_dropped_requirements: bool
-    renew_within: Threshold
-    left_out: tuple[str, ...]
-    template: str
-    at: datetime
-    zone: tzinfo = UTC
 
 
 @dataclass(frozen=True, slots=True)
@@ -364,7 +267,7 @@ def review(request: ReviewRequest, folder: Path) -> Review:
     with Folder(folder) as private:
         for name in (_HEAD, _BASE):
             private.mkdir(name, 0o700)
-    steps = _Review(request, head, base)
+    steps = _Review(request, head, base, UnreviewedFiles(request, head, base))
     steps_done = tuple(steps.all())
     return Review(
         request.base,
@@ -424,6 +327,7 @@ class _Review:
     request: ReviewRequest
     head: CommitFiles
     base: CommitFiles | None
+    unreviewed: UnreviewedFiles
     robots: dict[str, Fleet | None] = field(default_factory=dict)
     """The fleet of the policy or keystore that a step examines, by subject of the step."""
     unread_policy: SrosError | OSError | None = None
@@ -501,7 +405,12 @@ class _Review:
             yield from self._keystore_steps(path, keystore, base_keystores.get(path), head)
         # Not allowed by --new-access: its user has read the commit, not a checkout, which may
         # differ.
-        yield from self._step_result("files", "", self._git_attributes_step, can_be_allowed=False)
+        yield from self._step_result(
+            "files",
+            "",
+            lambda: _found_lines(self.unreviewed.converted_by_git()),
+            can_be_allowed=False,
+        )
         yield from self._step_result("keystore", " ".join(asked.keystores), self._keys_step)
         if self.base:
             yield from self._step_result("files", "", partial(self._unreviewed_step, head))
@@ -617,7 +526,7 @@ class _Review:
         became = ""
         if entry:
             became = "The change deletes it."
-            for name, tree_entry in self._changed_files(self.head, self.base):
+            for name, tree_entry in self.head.entries(unlike=self.base):
                 if tree_entry.id == entry.id:
                     became = f"The change renames it to '{name}'."
         elif below := self._same_name_below(path):
@@ -631,20 +540,11 @@ class _Review:
     def _same_name_below(self, path: str) -> str:
         """Return a file or folder of HEAD whose path ends with ``path``, or ""."""
         with suppress(SrosError):  # a hint, without which the error is right, too
-            for name, _ in self._changed_files(self.head, None):
+            for name, _ in self.head.entries():
                 before, found, _ = f"{name}/".partition(f"/{path.strip('/')}/")
                 if found:
                     return f"{before}{found}".rstrip("/")
         return ""
-
-    @staticmethod
-    def _changed_files(
-        side: CommitFiles, other: CommitFiles | None
-    ) -> Iterator[tuple[str, TreeEntry]]:
-        """Yield path and entry of files of a commit that the other commit lacks or has changed."""
-        tree = side.repository.tree(side.commit)
-        before = other.repository.tree(other.commit) if other else ""
-        return walk(side.repository, tree, maximum=_MOST_ENTRIES, other=before)
 
     def _fleet_step(
         self, base: _Policies, head: _Policies, fleet: Fleet
@@ -673,252 +573,20 @@ class _Review:
                     changes.append(FleetChange(where, f"{text}: {effect}"))
         return _fleet_findings(changes)
 
-    def _git_attributes_step(self) -> tuple[int, Content] | None:
-        """Return status and findings on reviewed files that git may change on checkout, or None."""
-        lines = []
-        for folder in sorted({parent for path in self.head.files for parent in Path(path).parents}):
-            path = str(folder / ATTRIBUTES_FILE)
-            entry = self.head.entry(path)
-            if entry is None or entry.mode not in FILES:
-                continue
-            patterns = converting_patterns(self.request.repository.content(entry.id))
-            below = sorted(file for file in self.head.files if Path(file).is_relative_to(folder))
-            for file in below if patterns else ():
-                relative = Path(file).relative_to(folder)
-                matching = (
-                    used
-                    for pattern, used in patterns.items()
-                    for place in (relative, *(relative.parents if used == EXPORT_IGNORE else ()))
-                    if may_match(pattern, str(place))
-                )
-                if attribute := next(matching, ""):
-                    does = "change it in a checkout or archive"
-                    # For example, an include may then use its fallback.
-                    if attribute == EXPORT_IGNORE:
-                        does = "leave it out of an archive"
-                    text = f"git may {does} ({attribute} in {path})"
-                    lines.append((text, file))
-        return (_FOUND, StepFindings(tuple(lines))) if lines else None
-
-    def _contents(
-        self, ids: Iterable[str], largest: int = _MAX_SEARCHED_BYTES
-    ) -> Iterator[tuple[str, bytes]]:
-        """Yield ids and contents of files that need not be policies; large files are left out."""
-        return self.request.repository.contents_in_batches(ids, _MOST_BYTES, largest=largest)
-
     def _keys_step(self) -> tuple[int, Content] | None:
         """Return status and findings on private keys in HEAD; None without any.
 
-        Keystores and changed files are searched.  Options that allow new access do not apply:
-        everybody who reads the repository has these keys.  Keys of keystores that are not reviewed,
-        and were there before, are only named.
+        Options that allow new access do not apply: everybody who reads the repository has these
+        keys.
         """
-        entries = dict(self._changed_files(self.head, self.base)) if self.base else {}
-        entries |= {
-            path: entry
-            for path, entry in self.head.files.items()
-            if _is_below(path, self.request.keystores)
-        }
-        earlier: dict[str, TreeEntry] = {}
-        with suppress(SrosError):  # `left_out` says that keys were not searched for
-            walked = self._changed_files(self.head, None)
-            earlier = {path: entry for path, entry in walked if path.endswith(KEY_FILE)}
-        key_files = {**earlier, **entries}
-        files = {path: entry.id for path, entry in key_files.items() if entry.mode in FILES}
-        keys = {
-            digits
-            for digits, content in self._contents(files.values())
-            if _PRIVATE_KEY.search(content)
-        }
-        lines = [
-            (_PRIVATE_KEY_FOUND, path)
-            for path, digits in sorted(files.items())
-            if digits in keys and not _is_below(path, self.request.left_out)
-        ]
-        failing = tuple(line for line in lines if line[1] in entries)
-        named = tuple(line for line in lines if line[1] not in entries)
-        return (_FOUND, StepFindings(failing, named)) if lines else None
+        facts = StepFindings(*map(tuple, self.unreviewed.private_keys()))
+        return (_FOUND, facts) if facts.lines else None
 
     def _unreviewed_step(self, reviewed: _Policies) -> tuple[int, Content] | None:
-        """Return status and findings on changed, unreviewed policies and keystores, or None."""
-        assert self.base
-        lines: list[tuple[str, str]] = []
-        named: list[tuple[str, str]] = []
-        changed = list(self._changed_files(self.head, self.base))
-        if len(changed) > _MOST_CHANGED:
-            raise DocumentError(f"the change has more than {_MOST_CHANGED} files")
-        names = {entry.id: name for name, entry in changed}
-        common = (policies_dir() / "common").rglob("*.xml")
-        shipped = {(part.name, part.read_bytes()) for part in common}
-        entries = dict(changed)
-        for path in self._policies_among(changed, self.head):
-            content = self.request.repository.content(entries[path].id)
-            if (Path(path).name, content) in shipped:
-                continue
-            text = f"{_NOT_USED_TEXT} --leave-out {quote(path)}, or delete it"
-            if reviewed.unread and any(map(Path(path).is_relative_to, self.request.policies)):
-                text = "changes and is not reviewed, because a policy could not be read"
-            lines.append((text, path))
-        earlier = list(self._changed_files(self.base, self.head))
-        for path in self._unreviewed_keystores([*changed, *earlier]):
-            if not self._has_entry(self.head, str(Path(path) / ENCLAVES)):
-                continue  # deleted by the change, or without enclaves
-            is_top = path == "."  # all files of the repository would belong to it
-            review = "move it into a folder" if is_top else "name it with --keystore"
-            place = f"{ENCLAVES} --leave-out {PUBLIC}" if is_top else quote(path)
-            text = f"is a keystore that changes and is not reviewed: {review}, or leave it out with"
-            lines.append((f"{text} --leave-out {place}", path))
-        for path in self._policies_used_in_part(changed, reviewed):
-            lines.append(("changes and is used only in part: the rest is not reviewed", path))
-        for path in self._unreviewed_policies_including(changed):
-            lines.append(("is not reviewed, and includes a file that changes", path))
-        sizes = self.request.repository.sizes(names)
-        for path, entry in changed:
-            if sizes.get(entry.id, 0) > _MAX_SEARCHED_BYTES and entry.mode in FILES:
-                named.append(("changes and is too large to be reviewed", path))
-            if clause := self._hidden_entry_clause(path, entry):
-                lines.append((f"changes and is not reviewed: it is {clause}", path))
-        for path in self._paths_of(changed, _is_packed):
-            named.append(
-                ("changes and is an archive, or compressed: the review does not look into it", path)
-            )
-        gone = [(path, entry) for path, entry in earlier if not self._has_entry(self.head, path)]
-        for path in self._policies_among(gone, self.base, known=False):
-            new = names.get(dict(gone)[path].id)
-            named.append((f"is renamed to '{new}'" if new else "is deleted", path))
-        facts = StepFindings(tuple(lines), tuple(named))
-        return (_FOUND if lines else _OK, facts) if facts.lines else None
-
-    def _policies_used_in_part(
-        self, changed: Iterable[tuple[str, TreeEntry]], reviewed: _Policies
-    ) -> Iterator[str]:
-        """Yield changed policies that reviewed policies or keystores include only in part."""
-        named = {str(path.relative_to(self.head.folder)) for path in reviewed.files}
-        known = {
-            path: self.head.written_content(path)
-            for path, _ in changed
-            if path in self.head.files and path not in named
-        }
-        policies = [path for path, data in known.items() if is_whole_policy(data)]
-        yield from self._parts_used_in_part(
-            {k: v for k, v in known.items() if k not in policies}, named
-        )
-        if not policies:
-            return
-        fleet = reviewed.fleet
-        rights = {right for policy in reviewed.read() for right in policy_rights(policy)}
-        for path in policies:
-            with suppress(SrosError):
-                (file,) = self.head.write_policies(path, placeholders=fleet is not None)
-                if rights.issuperset(policy_rights(read_policy_for(file, fleet))):
-                    continue
-            yield path
-
-    def _parts_used_in_part(
-        self, parts: Mapping[str, bytes], named: Iterable[str]
-    ) -> Iterator[str]:
-        """Yield changed files that the reviewed policies include only in part."""
-        files = self.head.files
-        whole = files_used_whole(
-            named, lambda path: self.head.written_content(path) if path in files else None
-        )
-        for path, data in parts.items():
-            with suppress(SrosError):
-                if not may_be_policy(data) or whole.get(path):
-                    continue
-                before = self.base.entry(path) if self.base else None
-                earlier = self.request.repository.content(before.id) if before else data
-                if path in whole and have_same_root(earlier, data):
-                    continue
-            yield path
-
-    def _unreviewed_policies_including(self, changed: Iterable[tuple[str, TreeEntry]]) -> list[str]:
-        """Return policies that are not reviewed and include a file that changes.
-
-        A policy includes only files in its own folder and below.  If no
-        reviewed policy includes the file, only policies whose names end with ``.xml`` are found.
-        """
-        repository, files = self.request.repository, self.head.files
-        parts = [
-            path
-            for path, entry in changed
-            if (
-                may_be_policy(self.head.written_content(path))
-                if path in files
-                else entry.mode in FILES and not _is_below(path, self.request.left_out)
-            )
-        ]
-        reviewed = {parent for part in parts if part in files for parent in Path(part).parents}
-        ids: dict[str, str] = {}
-        for folder in sorted({parent for part in parts for parent in Path(part).parents}):
-            entry = self.head.entry("" if folder == Path() else str(folder))
-            assert entry
-            for name, tree_entry in repository.folders([entry.id])[entry.id].items():
-                path = str(folder / name)
-                may_include = folder in reviewed or name.lower().endswith(".xml")
-                excluded = (*self.request.left_out, *self.request.keystores)
-                if may_include and tree_entry.mode in FILES and not _is_below(path, excluded):
-                    ids[path] = tree_entry.id
-        contents = {
-            digits: data for digits, data in self._contents(ids.values()) if may_include_files(data)
-        }
-        contents_by_path = {
-            path: contents[object_id] for path, object_id in ids.items() if object_id in contents
-        }
-        users = files_including(parts, contents_by_path)
-        return sorted(e for e in users if e not in files and is_whole_policy(contents_by_path[e]))
-
-    def _hidden_entry_clause(self, path: str, entry: TreeEntry) -> str:
-        """Return a clause on a link or submodule at a path that may hide policies, or "".
-
-        ``path`` is a path in HEAD.
-        """
-        excluded = (*self.request.left_out, *self.request.keystores)
-        if entry.mode not in (LINK, SUBMODULE) or _is_below(path, excluded):
-            return ""
-        if entry.mode == SUBMODULE:
-            return entry.kind
-        repository = self.request.repository
-        target = os.fsdecode(repository.content(entry.id))
-        with suppress(SrosError):
-            place = os.path.normpath(Path(path).parent / target)
-            linked = None if _is_below(place, self.request.left_out) else self.head.entry(place)
-            if linked and linked.mode in FILES and not may_be_policy(repository.content(linked.id)):
-                return ""
-        return f"a symbolic link to '{target[:_LONGEST_TARGET_SHOWN]}'"
-
-    @staticmethod
-    def _has_entry(side: CommitFiles, path: str) -> bool:
-        try:
-            return side.entry(path) is not None
-        except DocumentError:
-            return False
-
-    def _policies_among(
-        self, entries: Iterable[tuple[str, TreeEntry]], side: CommitFiles, *, known: bool = True
-    ) -> list[str]:
-        """Return the paths of entries that may be policies, or parts of policies.
-
-        With ``known``, files that were already written for ``side`` are left out.
-        """
-        unknown = ((path, entry) for path, entry in entries if not (known and path in side.files))
-        return self._paths_of(unknown, may_be_policy)
-
-    def _paths_of(
-        self, entries: Iterable[tuple[str, TreeEntry]], fits: Callable[[bytes], bool]
-    ) -> list[str]:
-        """Return the sorted paths of files that are not left out, and whose content ``fits``."""
-        wanted = {
-            path: entry
-            for path, entry in entries
-            if entry.mode in FILES and not _is_below(path, self.request.left_out)
-        }
-        fitting = {
-            digits
-            for digits, content in self._contents(entry.id for entry in wanted.values())
-            if fits(content)
-        }
-        return sorted(path for path, entry in wanted.items() if entry.id in fitting)
+        """Return status and findings on changed files that are not reviewed, or None."""
+        files, all_read = self.unreviewed, reviewed.unread is None
+        to_review = files.changes_to_review(reviewed.files, reviewed.fleet, all_read=all_read)
+        return _found_lines(to_review, files.changes_only_named())
 
     def left_out(self) -> Iterator[str]:
         """Yield clauses on the parts that were not reviewed."""
@@ -935,40 +603,7 @@ class _Review:
             yield "new access does not fail the review, as the options say"
         if asked.allow_dropped_requirements:
             yield "dropped requirements do not fail the review, as the options say"
-        for path in asked.left_out:
-            named = [f"'{policy}'" for policy in asked.policies if _is_below(policy, (path,))]
-            but = f", except {first_few(named, 3)}," if named else ""
-            yield f"policies in '{path}'{but} are not reviewed, as the options say"
-        if asked.keystores:
-            yield "private keys of keystores are not reviewed"
-        try:
-            for path in self._unreviewed_keystores(self._changed_files(self.head, None)):
-                yield f"'{path}' is a keystore and is not reviewed"
-        except SrosError as error:
-            yield f"keystores that did not change were not looked for: {error.what}"
-        own_template = asked.template and asked.template not in template_names()
-        if own_template and self.base and self._is_changed(asked.template):
-            yield f"'{asked.template}' changes, and the access that it gives is not compared"
-        for path in self._changed_settings():
-            yield f"'{path}' changes and is not reviewed"
-        for side in (self.head, self.base):
-            for path in dict.fromkeys(side.used_fallbacks if side else ()):
-                assert side
-                yield f"'{path}' is not in {side.name}, so the fallback of its include is used"
-        parents = asked.repository.parents(asked.head)
-        if asked.base and len(parents) > 1 and asked.base not in parents:
-            yield (
-                "access that a merged branch lost since BASE, and that the merge restores, is not "
-                "reported"
-            )
-        top = asked.repository.top()
-        if not top:
-            return
-        if asked.repository.commit(_HEAD) != asked.head:
-            yield "the commit that is checked out is not the reviewed commit"
-        elif differing := self.head.differing_files(top):
-            files = first_few([f"'{path}'" for path in differing], 3)
-            yield f"the checkout differs from the reviewed commit: {files}"
+        yield from self.unreviewed.clauses()
 
     def _undecided_in_namespaces(self) -> Iterator[str]:
         """Yield a clause if requirements may fail in a namespace, though no change breaks them."""
@@ -980,41 +615,12 @@ class _Review:
         if (
             not options
             and self.decided_elsewhere == ONLY_THE_CHANGE
-            and not any(map(self._is_changed, self.request.requirements))
+            and not any(map(self.unreviewed.is_changed, self.request.requirements))
         ):
             return
         add = f" (add {' '.join(options[:MOST_NAMESPACES])})" if options else ""
         decided = self.decided_elsewhere and f": sros only decided {self.decided_elsewhere}"
         yield f"{subject} /{add}{decided}"
-
-    def _unreviewed_keystores(self, entries: Iterable[tuple[str, TreeEntry]]) -> list[str]:
-        """Return keystores and exports with ``entries`` that are neither reviewed nor left out."""
-        known = (*self.request.keystores, *self.request.left_out)
-        folders = {_keystore_of_file(path) for path, _ in entries if not _is_below(path, known)}
-        return sorted(folder or "." for folder in folders if folder is not None)
-
-    def _changed_settings(self) -> list[str]:
-        """Return changed files with settings that are not read.
-
-        These are variables of an inventory, and TOML files that have a `_SETTINGS_TABLE`.
-        """
-        with suppress(SrosError):  # the step on changed files reports the error
-            changed = [*self._changed_files(self.head, self.base)] if self.base else []
-            earlier = [*self._changed_files(self.base, self.head)] if self.base else []
-            variables = {
-                path
-                for path, _ in (*changed, *earlier)
-                if self.request.fleet and not _VARIABLE_FOLDERS.isdisjoint(Path(path).parts)
-            }
-            files = {
-                path: entry.id
-                for path, entry in changed
-                if path.endswith(".toml") and path not in self.head.files and entry.mode in FILES
-            }
-            contents = self._contents(files.values(), _LARGEST_SETTINGS)
-            settings = {digits for digits, content in contents if _SETTINGS_TABLE.search(content)}
-            return sorted(variables | {path for path in files if files[path] in settings})
-        return []
 
     # ── policies ───────────────────────────────────────────────────────────────────────────
 
@@ -1181,13 +787,6 @@ class _Review:
             return read_template(file)
         raise self._missing_file_error(choice)
 
-    def _is_changed(self, path: str) -> bool:
-        """Return whether a file of HEAD differs from BASE, or may differ."""
-        try:
-            return not self.base or self.base.entry(path) != self.head.entry(path)
-        except DocumentError:  # a link is on the path, perhaps only in BASE
-            return True
-
     # ── keystores ──────────────────────────────────────────────────────────────────────────
 
     def _keystore_fleet(self, path: str) -> Fleet | None:
@@ -1212,7 +811,7 @@ class _Review:
     def _keystore_steps(
         self, path: str, folder: Path, before: Path | None, policies: _Policies
     ) -> Iterator[ReviewStep]:
-        has_new_settings = not before or self._is_changed(f"{path}/{SETTINGS}")
+        has_new_settings = not before or self.unreviewed.is_changed(f"{path}/{SETTINGS}")
         stated: tuple[Policy, ...] = ()
         with suppress(SrosError, OSError):  # the step on policies reports the error
             stated = policies.read()
@@ -1227,7 +826,7 @@ class _Review:
                 finding
                 for finding in all_findings()
                 if (finding.id != _FILE_MISSING or Path(finding.file).name != KEY_FILE)
-                and (not finding.file or _is_below(os.path.normpath(finding.file), (str(folder),)))
+                and Path(os.path.normpath(finding.file or folder)).is_relative_to(folder)
             )
             strict = bool(self.base) and has_new_settings
             wanted = FindingFilter(exclude=_UNSIGNED_POLICY_IDS, strict=strict)
@@ -1287,7 +886,14 @@ def _fleet_findings(changes: Iterable[FleetChange]) -> tuple[int, Content] | Non
     lines: dict[bool, list[tuple[str, str]]] = {True: [], False: []}
     for change in changes:
         lines[change.is_access].append((change.text, change.name))
-    facts = StepFindings(tuple(lines[True]), tuple(lines[False]))
+    return _found_lines(lines[True], lines[False])
+
+
+def _found_lines(
+    failing: Iterable[tuple[str, str]], shown_only: Iterable[tuple[str, str]] = ()
+) -> tuple[int, Content] | None:
+    """Return status and findings of a step; None without findings."""
+    facts = StepFindings(tuple(failing), tuple(shown_only))
     return (_FOUND if facts.failing else _OK, facts) if facts.lines else None
 
 
@@ -1308,29 +914,6 @@ def _moved_keys(
             continue
         had = old.name if old else "no robot"
         yield FleetChange(robot.name, f"gets the keys of {enclave}, which {had} had before")
-
-
-_FILES_OF_ENCLAVES = (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES)
-_TRUSTED_FILES = (CRL, *map(ca_certificate_path, ROLES))
-"""The files of a keystore that all enclaves trust."""
-
-
-def _keystore_of_file(path: str) -> str | None:
-    """Return the keystore or export that a file belongs to, by its path; None for other files."""
-    keystore, enclaves, file = f"/{path}".partition(f"/{ENCLAVES}/")
-    if enclaves and Path(file).name in _FILES_OF_ENCLAVES:
-        return keystore[1:]
-    trusted = next((name for name in _TRUSTED_FILES if f"/{path}".endswith(f"/{name}")), "")
-    return f"/{path}".removesuffix(f"/{trusted}")[1:] if trusted else None
-
-
-def _is_packed(content: bytes) -> bool:
-    """Return whether a file is an archive, or compressed."""
-    return content.startswith(_ARCHIVE_SIGNATURES) or content[257:262] == b"ustar"
-
-
-def _is_below(path: str, folders: Iterable[str]) -> bool:
-    return any(f"{path}/".startswith(f"{folder}/") for folder in folders)
 
 
 def _chosen(

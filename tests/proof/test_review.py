@@ -28,7 +28,7 @@ from sros_tool.fleet.fleet_file import inventory, render_fleet
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.policy.model import ALLOW, PEER_RIGHT
 from sros_tool.policy.rights import KIND_OF, Right, renamed_enclaves
-from sros_tool.proof import escapes, review, reviewed_requirements
+from sros_tool.proof import commit_files, escapes, reviewed_requirements
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import NODE, PROJECT
@@ -1650,7 +1650,7 @@ def test_whether_a_keystore_is_signed_for_the_policies(
         change.commit({f"ks/{file}": new})
         assert "'ks' is a keystore that ch" in change.review("--policy", "robot.xml").out, file
     with monkeypatch.context() as patched:
-        patched.setattr(review, "_MOST_ENTRIES", 20)
+        patched.setattr(commit_files, "_MOST_ENTRIES", 20)
         change.commit({"README": "y"})
         assert "keystores that did not ch" in change.review("--policy", "robot.xml").out
     left = ("--leave-out", "enclaves", "--leave-out", "r1/export", "--leave-out", "ks")
