@@ -8,7 +8,6 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence, Set
-from contextlib import suppress
 from datetime import timedelta
 from itertools import chain
 from pathlib import Path
@@ -36,6 +35,7 @@ from sros_tool.close.state import (
 )
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.files import remove_file
+from sros_tool.folders import remove_folders
 from sros_tool.names import expand
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import node_argument
@@ -195,8 +195,7 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> tuple[CloseState, str]:
     for path in drop_ins:
         if not dry_run:
             remove_file(path)
-            with suppress(OSError):  # the unit has other drop-ins
-                path.parent.rmdir()
+            remove_folders([path.parent])  # unless the unit has other drop-ins
         robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
     # A unit without a drop-in still runs closed if an earlier --undo was killed before the restart.
     units |= {
