@@ -106,6 +106,8 @@ def test_a_good_file(folder: Path) -> None:
         (CLAIM, 'claim = { party = "spy", expected = "readable" }', 23, "spy has the role"),
         (CLAIM, CLAIM.replace("listener", "client"), 23, "needs listener, talker and expected,"),
         (CLAIM, CLAIM.replace('"heard"', '"started"'), 23, "needs party and expected, and no"),
+        (CLAIM, 'claim = { client = "a", server = "b", expected = "not heard" }', 23,
+         "it has client, server, expected. With these keys, write 'not answered'."),
         (CLAIM, "claim = 3", 23, "claim is not a table"),
         (CLAIM, 'claim = ["viewer hears camera"]', 23, '\'viewer hears camera\' is not a table'),
         (CLAIM, 'claims = ["viewer hears camera"]', 23, "write tables [[row.claim]]"),

@@ -330,7 +330,13 @@ def _read_claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party
     sides = _PARTIES[relation]
     if set(claim) != {*sides, "expected"}:
         problem = f"a {key} {expected!r} needs {', '.join(sides)} and expected, and no other keys"
-        raise table.error(key, f"{problem}; it has {', '.join(claim)}")
+        fitting = [
+            repr(other)
+            for other, (relation_of_other, does_happen) in _CLAIMS.items()
+            if set(claim) == {*_PARTIES[relation_of_other], "expected"} and does_happen is holds
+        ]
+        remedy = f"With these keys, write {' or '.join(fitting)}." if fitting else ""
+        raise table.error(key, f"{problem}; it has {', '.join(claim)}", remedy)
     names = [claim[side] for side in sides]
     for side, name in zip(sides, names, strict=True):
         if not isinstance(name, str) or name not in parties:
