@@ -232,7 +232,7 @@ def remapped_policies(
     for rule in rules:
         uses = {use for _, of_policy in remapped for use in of_policy if use.rule == rule}
         if not uses:
-            raise _unused_rule_error(rule, rules, policies, left_out)
+            raise _unused_rule_error(rule, rules, policies, file, left_out)
         nodes = sorted({use.node for use in uses})
         if rule.old == _NODE and len(nodes) > 1:
             text = (
@@ -253,6 +253,7 @@ def _unused_rule_error(
     rule: Remapping,
     rules: Sequence[Remapping],
     policies: Iterable[Policy],
+    file: Policy,
     left_out: Iterable[Policy],
 ) -> UsageError:
     """Return the error for a rule that changes nothing, with the reason."""
@@ -284,11 +285,12 @@ def _unused_rule_error(
             f"They have no node {rule.node}, and only use names below it: {enumerated(below)}.",
             f"Remap each name: `{' '.join(options)}`.",
         )
-    if similar := _similar_names(rule, policies):
+    renamed = {(u.kind, u.old) for each in policies for u in remapped_policy(each, rules)[1]}
+    if similar := _similar_names(rule, policies, file, renamed):
         names = " or ".join(similar)
         reason = f"Perhaps the right name is {names}, for example after an update of a package."
     else:
-        names = ", ".join(_similar_names(rule, policies, at_least=0)) or "no names"
+        names = ", ".join(_similar_names(rule, policies, file, renamed, at_least=0)) or "no names"
         reason = f"They have {names}. Perhaps an update of a package changed the name."
     return UsageError(
         f"--remap {rule} matches no name or node in the policies to merge",
@@ -316,11 +318,19 @@ def _with_node(name: str, rule: Remapping) -> str:
     return f"/{name}".replace(f"/{rule.node}/", f"/{rule.new}/", 1)[1:]
 
 
-def _similar_names(rule: Remapping, policies: Iterable[Policy], at_least: float = 0.6) -> list[str]:
+def _similar_names(
+    rule: Remapping,
+    policies: Iterable[Policy],
+    file: Policy,
+    renamed: Collection[tuple[str, str]],
+    at_least: float = 0.6,
+) -> list[str]:
     """Return the names in policies that are most similar to the old name of a rule.
 
-    If no node has the rule's node, these are names of nodes.  ``at_least`` is the lowest similarity
-    of a returned name, from 0 to 1.
+    First are names of the kind that the new name has in ``file``, the policy to merge into, then
+    names that ``file`` does not have, and that are not ``renamed`` by another rule.  If no node has
+    the rule's node, the result is names of nodes.  ``at_least`` is the lowest similarity of a
+    returned name, from 0 to 1.
     """
     from difflib import get_close_matches  # imported only for this error
 
@@ -333,15 +343,19 @@ def _similar_names(rule: Remapping, policies: Iterable[Policy], at_least: float 
     nodes = {profile.node for profile in profiles}
     if rule.node and rule.node not in nodes:
         return get_close_matches(rule.node, nodes, _MOST_SHOWN, at_least)
-    names = {
-        name
-        for profile in profiles
-        if rule.node in ("", profile.node)
-        for group in profile.groups
-        for name in group.names
-        if not is_expression(name)
-    }
-    return get_close_matches(rule.old, names, _MOST_SHOWN, at_least)
+    present = {(right.kind, right.name) for right in policy_rights(file)}
+    known = {*present, *renamed}
+    kinds = {kind for kind, name in present if f"{name}/".endswith(f"/{rule.new.strip('/')}/")}
+    ranks: dict[str, tuple[bool, bool]] = {}
+    for profile in profiles:
+        for group in profile.groups if rule.node in ("", profile.node) else ():
+            for name in group.names:
+                if not is_expression(name):
+                    full = expand(name, profile.ns, profile.node)
+                    rank = (group.kind not in kinds, (group.kind, full) in known)
+                    ranks[name] = min(rank, ranks.get(name, rank))
+    similar = get_close_matches(rule.old, ranks, len(ranks) or 1, at_least)
+    return sorted(similar, key=ranks.__getitem__)[:_MOST_SHOWN]
 
 
 def _moves_with_node(use: UsedRule, old: str, new: str) -> bool:

@@ -19,7 +19,15 @@ from sros_tool.files import policies_dir, replace_file
 from sros_tool.names import NODE_SERVICES
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from tests.support.harness import policy_text, publish, snapshot, sros, subscribe, with_includes
+from tests.support.harness import (
+    may,
+    policy_text,
+    publish,
+    snapshot,
+    sros,
+    subscribe,
+    with_includes,
+)
 from tests.support.long_form import sometimes
 
 DENY = '<topics publish="DENY"><topic>cmd_vel</topic></topics>'
@@ -197,6 +205,13 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
     ):
         ended = sros(*words, *more, cwd=folder)
         assert (ended.status, said in ended.err) == (2, True), ended
+    (folder / "robot.xml").write_text(policy_text({"/cam": publish("gap", "width_at_home")}))
+    changed = policy_text({"/cam": publish("width_at_home", "opening") + may("reply", "widths")})
+    (folder / "cam.xml").write_text(changed)  # the topic `width`, remapped to `gap`, is `opening`
+    ended = sros("merge_policy", "robot.xml", "cam.xml", "--remap", "withd:=gap", cwd=folder)
+    assert "Perhaps the right name is widths, for" in ended.err
+    ended = sros("merge_policy", "robot.xml", "cam.xml", "--remap", "xyz:=gap", cwd=folder)
+    assert "They have opening, width_at_home, widths. Perhaps" in ended.err
     panel = policy_text({"/panel": publish("eye/lid", "/front/eye/park", "eyes/lid")})
     (folder / "cam.xml").write_text(panel)
     ended = sros(*words, "eye:__node:=left_eye", cwd=folder)
