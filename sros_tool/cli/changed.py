@@ -43,6 +43,7 @@ def print_changed(
     json_data: tuple[object, ...] | None = None,
     lines: Iterable[str] = (),
     *,
+    planned: Iterable[str] = (),
     first: Iterable[str] = (),
     after: Iterable[str] = (),
     rights: bool = True,
@@ -55,6 +56,7 @@ def print_changed(
         result: the change.
         json_data: what ``--json`` prints of the change; None without ``--json``.
         lines: what was done; a dry run prints the files that it would change instead.
+        planned: lines that a dry run prints before these files.
         first: messages that come first on standard error.
         after: messages that come after the lines about changed rights.
         rights: say which rights enclaves lose and gain.
@@ -64,6 +66,8 @@ def print_changed(
     if json_data is not None:
         print_json(json_data)
     elif result.dry_run:
+        for line in planned:
+            echo(line)
         print_plan(result.root, result.changes)
     else:
         for line in lines:
@@ -157,8 +161,20 @@ def print_files(root: Path, words: str, paths: Sequence[str]) -> None:
         echo(f"{words} {root / path}")
 
 
+def planned_lines(root: Path, names: Sequence[str], text: str) -> Iterator[str]:
+    """Yield lines as `enclave_lines` does; the robots of a fleet share a line."""
+    folded = list(_folded_by_robot(root, ((name, name) for name in names)))
+    yield from enclave_lines(folded if len(folded) <= MAX_NAMES else names, text)
+
+
 def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
     """Yield the paths of files; paths that differ only in the robot of a fleet share a line."""
+    lines = ((f"/{path.partition('/')[2].rpartition('/')[0]}", path) for path in paths)
+    yield from _folded_by_robot(root, lines)
+
+
+def _folded_by_robot(root: Path, lines: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Yield lines about enclaves; lines that differ only in the robot of a fleet become one."""
     from sros_tool.fleet.robots import folded_lines
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import OpenedKeystore
@@ -166,7 +182,6 @@ def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
     fleet = None
     with suppress(SrosError):  # a new keystore and an export have no fleet
         fleet = load_fleet(OpenedKeystore(root))
-    lines = ((f"/{path.partition('/')[2].rpartition('/')[0]}", path) for path in paths)
     yield from folded_lines(fleet, lines)
 
 

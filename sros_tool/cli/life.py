@@ -14,6 +14,7 @@ import click
 from sros_tool.cli.changed import (
     enclave_lines,
     json_form,
+    planned_lines,
     print_changed,
     print_follow_up,
     print_plan,
@@ -276,7 +277,13 @@ def revoke(
 
         enclaves = list(map(RevokedEnclave, result.outcomes))
         shown = json_form(result, "RevokedEnclaves", enclaves=enclaves)
-    print_changed(result, shown, enclave_lines(tuple(result.outcomes), "revoked enclave {}"))
+    names = tuple(result.outcomes)
+    print_changed(
+        result,
+        shown,
+        enclave_lines(names, "revoked enclave {}"),
+        planned=planned_lines(root, names, "would revoke enclave {}"),
+    )
 
 
 @verb("crl")

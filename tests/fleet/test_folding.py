@@ -185,6 +185,8 @@ def test_what_a_change_takes_away_is_folded(made: Path) -> None:
     assert "a program that still uses a lost right may fail to start" in said[4]
     assert "base and 1 more: the rights that they lost still" in said[5]
     assert "`sros renew ks ENCLAVE... --revoke-old`" in said[5]
+    planned = sros("revoke", "ks", "--match", "/r*", "--dry-run", cwd=made).ok().out
+    assert planned.startswith("would revoke enclave /{robot}/base  (all 3 robots)\nwould ")
 
 
 def test_a_robot_in_another_domain_is_a_difference(made: Path) -> None:

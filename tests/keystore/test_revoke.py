@@ -412,6 +412,7 @@ def test_the_program(tmp_path: Path) -> None:
     before = snapshot(root)
     plan = sros("revoke", root, "/a", "--dry-run").ok()
     assert snapshot(root) == before
+    assert plan.out.startswith("would revoke enclave /a\nwould ")
     assert "enclaves/a/key.pem" in plan.out
     done = sros("revoke", root, "/a", "--reason", "key-compromise").ok()
     assert done.out == "revoked enclave /a\n"
