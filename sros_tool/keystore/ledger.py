@@ -94,6 +94,11 @@ Publishing waits until the enclave is revoked, or has a key that the ledger reco
 """
 ON_ROBOT_ONLY = "on robot only"
 """The ``reason`` of a restore, on a line with an enclave of a release that the keystore lacks."""
+LOST_CA = "lost CA"
+"""The ``reason`` of a restore after which robots have certificates of a later identity CA.
+
+Publishing waits until the keystore has an identity CA that the ledger records after this line.
+"""
 RENEWED_BY_NAME = "renewed by name"
 """The ``reason`` of permissions that `sros renew` signed for a named enclave after a restore."""
 NEW_CA = "new CA"

@@ -1411,6 +1411,37 @@ def test_messages_that_show_later_releases_refuse_a_new_folder(home: Home) -> No
     sros(*publish, "--restored", cwd=home.folder).ok()
 
 
+def test_a_restored_keystore_without_releases_never_brings_back_a_ca_that_was_replaced(
+    home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the certificates of robots, which the seals of their releases list, show the CA."""
+    backup, now = copy_of(home.root, home.folder / "backup"), DUE
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: now)
+    rotate = ("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    home.run(*rotate)
+    home.run("fleet", "publish", "ks", "pub")
+    seals = {each.robot: each.seal.decode() for each in releases_in(home.folder / "pub", 3)}
+    for robot in ("r1", "r2"):
+        home.run("distribute_key", "ks", "--robot", robot, robot, "--force")
+        home.send(robot, now, seal=seals[robot])
+    (home.folder / "inbox/r2").rename(home.folder / "late")
+    for path in (home.root, home.folder / "pub"):
+        shutil.rmtree(path)
+    backup.rename(home.root)
+    now += timedelta(minutes=1)
+    (note, *_) = home.collect(now).notes
+    assert "Its identity CA was replaced after the backup." in note.text
+    publish = ("fleet", "publish", "ks", "pub", "--restored", "--new-folder")
+    refused = sros(*publish, cwd=home.folder)
+    assert (refused.status, (home.folder / "pub").exists()) == (2, False), refused
+    assert "(`sros rotate_ca ks --identity --finish --allow-unconfirmed`)" in refused.err
+    now += timedelta(minutes=1)
+    home.run(*rotate)
+    (home.folder / "late").rename(home.folder / "inbox/r2")
+    assert "identity CA" not in "".join(note.text for note in home.collect(now).notes)
+    sros(*publish, cwd=home.folder).ok()
+
+
 def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
     home: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -49,6 +49,7 @@ from sros_tool.keystore.delivery.published import may_have_later_releases, read_
 from sros_tool.keystore.delivery.restored import (
     LaterSeals,
     has_unpublished_restore,
+    lost_ca_remedy,
     perhaps_revoked_step,
 )
 from sros_tool.keystore.delivery.signing import certify_requests
@@ -253,6 +254,8 @@ def collect(
                 forgotten.later_number = max(number, forgotten.later_number)
             forgotten.perhaps_revoked |= seals.missing_enclaves(message.seal)
             if message.signer_certificate:
+                if number and seals.lost_ca_issued(message.seal, message.signer_certificate):
+                    forgotten.has_lost_ca = True
                 forgotten.add_certificate(
                     message.signer_certificate,
                     REPORTED,
@@ -271,7 +274,10 @@ def collect(
         not_signed, notes, signed = _revoke_again(
             root, forgotten, robots_with_lists, taken, now=now, keyring=keyring, dry_run=dry_run
         )
-        notes = [*_later_release_notes(keystore, robots_with_seals), *notes]
+        later_notes = _later_release_notes(
+            keystore, robots_with_seals, has_lost_ca=forgotten.has_lost_ca
+        )
+        notes = [*later_notes, *notes]
         after = OpenedKeystore(root)
         _defer_requests(
             after,
@@ -1083,15 +1089,20 @@ def _revoke_again(
     return "", [*notes, *restored.notes], [*changes_below(root, restored.changes)]
 
 
-def _later_release_notes(keystore: OpenedKeystore, robots: Sequence[str]) -> Iterator[Note]:
+def _later_release_notes(
+    keystore: OpenedKeystore, robots: Sequence[str], *, has_lost_ca: bool
+) -> Iterator[Note]:
     """Yield a note on robots with releases that the keystore sealed, but does not know any more."""
     if robots:
         have = f"{first_few(robots, _SHOWN)} {'has' if len(robots) == 1 else 'have'}"
+        first = f" after {lost_ca_remedy(keystore)}, and" if has_lost_ca else ""
+        lost = " Its identity CA was replaced after the backup." if has_lost_ca else ""
         yield Note(
             "fleet.later-release",
             f"{have} a release that the keystore sealed but does not know: the keystore was "
-            "restored from a backup, or is a copy. It publishes and renews again only after "
-            f"{restored_command(keystore)}; docs/howto/keystore_is_lost.md has the other steps.",
+            f"restored from a backup, or is a copy.{lost} It publishes and renews again only{first}"
+            f" after {restored_command(keystore)}; docs/howto/keystore_is_lost.md has the other "
+            "steps.",
         )
 
 

@@ -68,6 +68,7 @@ from sros_tool.keystore.delivery.restored import (
     older_than_robots_error,
     other_changes_notes,
     perhaps_revoked_enclaves,
+    refuse_lost_ca,
     refuse_lost_changes,
     restores_after_last_release,
     with_earlier_keys,
@@ -726,6 +727,7 @@ class _Publication:
         if restored and not is_later:
             self._check_removed()
         if restored:
+            refuse_lost_ca(self.keystore)
             forgotten = LostRecords(self.keystore, self._now)
             if is_later or unknown:
                 unknown = [self._latest_release()] if is_later else unknown

@@ -21,6 +21,7 @@ from shlex import quote
 from typing import Annotated, NamedTuple
 
 from cryptography import x509
+from cryptography.hazmat.primitives import serialization
 
 from sros_tool.dds.governance import parse_governance, render_governance
 from sros_tool.dds.permissions import parse_permissions
@@ -45,8 +46,10 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import (
     LATER_RELEASE,
+    LOST_CA,
     PERHAPS_REVOKED,
     PUBLISHING,
+    RECORDED_LATE,
     RENEWED_BY_NAME,
     RESTORED,
     Entry,
@@ -56,6 +59,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     authority_text,
+    issued_by,
     key_digest,
     key_digest_of_ca,
     load_certificates,
@@ -237,6 +241,28 @@ class LaterSeals:
                         if f"{enclave_folder(name)}/{CERTIFICATE_FILE}" not in listed
                     } - self._marked
         return set()
+
+    def lost_ca_issued(self, seal: str | None, certificate: x509.Certificate) -> bool:
+        """Return whether a seal lists a certificate of an identity CA that the keystore has lost.
+
+        The seal is that of a later release (`later_number`), so the keystore issued the
+        certificate.  A certificate from before the present CA shows nothing: the CA was replaced
+        again since.
+        """
+        with suppress(SrosError):
+            authorities = self._keystore.authority(IDENTITY)
+            is_earlier = (
+                validity_of(certificate).not_before < validity_of(authorities[0]).not_before
+            )
+            if is_earlier or any(issued_by(certificate, each) for each in authorities):
+                return False
+            pem = certificate.public_bytes(serialization.Encoding.PEM)
+            sha256 = hashlib.sha256(pem).hexdigest()
+            files = _LISTED_FILE.findall(smime.parse((seal or "").encode()).text.decode())
+            return any(
+                listed == sha256 and path.endswith(f"/{CERTIFICATE_FILE}") for listed, path in files
+            )
+        return False
 
     def explains(self, seal: str | None, certificate: x509.Certificate) -> bool:
         """Return whether a known restore explains that the ledger lacks a robot's certificate.
@@ -704,6 +730,37 @@ def _missing_step(root: str, missing: Sequence[str]) -> str:
         "key of such an enclave, sign its request again before you sign the policy, with `sros "
         f"sign_request {root} REQUEST --no-answer -p POLICY_FILE --fleet FLEET_FILE`."
     )
+
+
+def lost_ca_remedy(keystore: OpenedKeystore) -> str:
+    """Return the command that replaces an identity CA which was replaced after the backup."""
+    separate = " --identity" if len(keystore.authority_files) > 1 else ""
+    where = quote(str(keystore.root))
+    return f"`sros rotate_ca {where}{separate} --finish --allow-unconfirmed`"
+
+
+def refuse_lost_ca(keystore: OpenedKeystore) -> None:
+    """Raise `KeystoreError` if messages showed certificates of an identity CA that was lost.
+
+    An identity CA that the ledger records after these messages mends this.
+    """
+    current = key_digest_of_ca(keystore.ca_certificate(IDENTITY))
+    is_lost = False
+    for entry in keystore.ledger_with("what", RESTORED).entries:
+        if entry.what == "ca" and entry.key == current and entry.reason not in RECORDED_LATE:
+            is_lost = False
+        elif entry.what == RESTORED and entry.reason == LOST_CA:
+            is_lost = True
+    if is_lost:
+        raise KeystoreError(
+            f"the identity CA was replaced after the backup of the keystore '{keystore.root}'",
+            "Robots have certificates of a later CA, as their messages show. Publishing would put "
+            "robots back on an earlier CA, whose key somebody may have copied.",
+            "Restore a backup from after the rotation. If there is none, repeat later revocations, "
+            f"repeat the rotation ({lost_ca_remedy(keystore)}), and repeat this command. If you "
+            "have the key of the later CA, add --identity-ca FILE --identity-key PLACE to the "
+            "command of the rotation (docs/howto/keystore_is_lost.md).",
+        )
 
 
 def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> None:

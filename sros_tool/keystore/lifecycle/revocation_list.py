@@ -88,6 +88,8 @@ class LostRecords:
         """Highest number of a robot's release that the keystore sealed and does not know, or 0."""
         self.perhaps_revoked: set[str] = set()
         """Enclaves of the keystore that such a release of their robot lacks."""
+        self.has_lost_ca = False
+        """Whether robots have certificates of an identity CA that the keystore has lost."""
         self.explained: set[str] = set()
         """Serial numbers of certificates from before a restore that is known already."""
         self._now = now

@@ -34,6 +34,7 @@ from sros_tool.keystore.layout import (
     key_on_robot,
 )
 from sros_tool.keystore.ledger import (
+    LOST_CA,
     ON_ROBOT_ONLY,
     PERHAPS_REVOKED,
     RESTORED,
@@ -209,7 +210,8 @@ def restore_revocations(
     names the rights that these enclaves lost after the backup, so that a later renewal counts as
     consent to these rights.  These further entries are left out while there are certificates to
     replace first.  Each of the enclaves ``perhaps_revoked`` that stays has an entry, too, and each
-    of ``on_robots_only``, enclaves that the keystore lacks: robots may have made their keys.
+    of ``on_robots_only``, enclaves that the keystore lacks: robots may have made their keys.  If an
+    identity CA was lost, an entry says so.
 
     Raises:
         KeystoreError: as `revoke`.
@@ -298,6 +300,7 @@ def restore_revocations(
                 mark._replace(enclave=name, reason=ON_ROBOT_ONLY)
                 for name in sorted({*on_robots_only})
             ),
+            *([mark._replace(reason=LOST_CA)] if forgotten_lists.has_lost_ca else ()),
         ]
         change.entries = [*(marks if shows_restore else ()), *unknown.values()]
         if revocations or forgotten_lists.lists:
