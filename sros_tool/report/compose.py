@@ -297,6 +297,7 @@ def _picture(
         unread=tuple(units for source in sources for units in source.unread),
         join_needs_right=governance is not None
         and all(rule.enable_join_access_control for rule in governance.domain_access_rules),
+        has_least_levels=governance is None,
     )
 
 

@@ -20,7 +20,6 @@ from sros_tool.policy.patterns import matches
 from sros_tool.report.folding import Folding
 from sros_tool.report.layout import (
     KIND_NAMES,
-    LEVEL_NAMES,
     LINE,
     ONLOOKERS,
     OTHERS,
@@ -30,12 +29,12 @@ from sros_tool.report.layout import (
     Card,
     Link,
     Scene,
+    level_name,
 )
 from sros_tool.report.pages import escape, render_page
 from sros_tool.report.picture import (
     Lack,
     Name,
-    Overlay,
     OverlaySide,
     Picture,
     Spelling,
@@ -164,7 +163,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
             *(link.violates, link.qualifier is not ALLOW, link.differs, rank[link.mark]),
         ),
     ):
-        lines.append(_svg_link(link, cards, picture.overlay))
+        lines.append(_svg_link(picture, link, cards))
     lines += [line for card in scene.cards for line in _svg_card(card)]
     lines.append("</g>")
     for number, text in enumerate(legend):
@@ -221,8 +220,9 @@ def _curve(link: Link, source: Card, target: Card) -> str:
 _DIFFERS = "the robots (namespaces, enclaves) that are drawn as one do not have this right"
 
 
-def _link_text(link: Link, overlay: Overlay | None) -> str:
+def _link_text(picture: Picture, link: Link) -> str:
     """Return the tooltip of a link."""
+    overlay = picture.overlay
     text = f"{link.qualifier.value} {', '.join(link.rights)}"
     if link.wildcard:
         text += " (by a wildcard)"
@@ -232,7 +232,7 @@ def _link_text(link: Link, overlay: Overlay | None) -> str:
         text += f": {_DIFFERS}"
     if overlay and link.mark is not OverlaySide.BOTH:
         text += f": {overlay.first if link.mark is OverlaySide.FIRST else overlay.second}"
-    return f"{text}, {LEVEL_NAMES[link.level]}"
+    return f"{text}, {level_name(picture, link.level)}"
 
 
 def _link_classes(link: Link) -> str:
@@ -246,11 +246,11 @@ def _link_classes(link: Link) -> str:
     return " ".join(classes)
 
 
-def _svg_link(link: Link, cards: dict[str, Card], overlay: Overlay | None) -> str:
+def _svg_link(picture: Picture, link: Link, cards: dict[str, Card]) -> str:
     source, target = cards[link.source], cards[link.target]
     return (
         f'<path class="{_link_classes(link)}" d="{_curve(link, source, target)}">'
-        f"<title>{escape(_link_text(link, overlay))}</title></path>"
+        f"<title>{escape(_link_text(picture, link))}</title></path>"
     )
 
 
@@ -300,7 +300,7 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
             (
                 f'<path class="lock lock-{level.value}" transform="translate(0 -10)" '
                 f'd="{_LOCKS[level]}"/><path class="link {level.value}" d="M20 -4h40"/>',
-                LEVEL_NAMES[level],
+                level_name(picture, level),
             )
             for level in levels
         )
@@ -397,11 +397,13 @@ def render_dot(picture: Picture, scene: Scene) -> str:
     clusters = _clusters(cards)
     for number, (title, members) in enumerate(clusters.items()):
         lines.append(f"  subgraph cluster_{number} {{ label={_dot_quoted(title)}; style=rounded")
-        lines += [f"    {_dot_node(scene, key, cards[key])}" for key in members]
+        lines += [f"    {_dot_node(picture, scene, key, cards[key])}" for key in members]
         lines.append("  }")
     inside = {key for members in clusters.values() for key in members}
     lines += [
-        f"  {_dot_node(scene, key, card)}" for key, card in cards.items() if key not in inside
+        f"  {_dot_node(picture, scene, key, card)}"
+        for key, card in cards.items()
+        if key not in inside
     ]
     lines += [f"  {_dot_edge(picture, link)}" for link in scene.links]
     return "\n".join((*lines, "}", ""))
@@ -414,11 +416,11 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
     lines = ["---", f"title: {_yaml_quoted(_picture_title(picture))}", "---", "flowchart LR"]
     for number, (title, members) in enumerate(clusters.items()):
         lines.append(f'  subgraph g{number}["{_escaped_for_mermaid(title)}"]')
-        lines += [f"    {_mermaid_node(scene, key, cards[key])}" for key in members]
+        lines += [f"    {_mermaid_node(picture, scene, key, cards[key])}" for key in members]
         lines.append("  end")
     inside = {key for members in clusters.values() for key in members}
     for key in [key for key in cards if key not in inside]:
-        lines.append(f"  {_mermaid_node(scene, key, cards[key])}")
+        lines.append(f"  {_mermaid_node(picture, scene, key, cards[key])}")
     styles: dict[str, list[int]] = defaultdict(list)
     for number, link in enumerate(scene.links):
         arrow = _MERMAID_ARROWS[link.level.value] if link.qualifier is ALLOW else "--x"
@@ -460,7 +462,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
         stated = known[kind, name]
         level = stated.protection.level
         remarks: list[str] = [stated.spelling] if stated.spelling in _MOVING else []
-        remarks += [] if level is WireLevel.UNKNOWN else [LEVEL_NAMES[level]]
+        remarks += [] if level is WireLevel.UNKNOWN else [level_name(picture, level)]
         cells = [f"{KIND_NAMES[kind]} {code(name)}" + f" ({'; '.join(remarks)})" * bool(remarks)]
         controls = stated.protection.write_control, stated.protection.read_control
         sides = Lack.SENDER, Lack.RECEIVER
@@ -545,9 +547,9 @@ def _node_key(card: str) -> str:
     return card if card[0] == "n" else f"e{card[1:]}"
 
 
-def _card_texts(scene: Scene, card: Card) -> Iterable[str]:
+def _card_texts(picture: Picture, scene: Scene, card: Card) -> Iterable[str]:
     if card.kind:
-        yield KIND_NAMES[card.kind] + _level_text(card)
+        yield KIND_NAMES[card.kind] + _level_text(picture, card)
     yield from card.members if len(card.members) <= len(card.lines) else card.lines
     yield from card.notes
     for onlooker in scene.onlookers:
@@ -556,8 +558,8 @@ def _card_texts(scene: Scene, card: Card) -> Iterable[str]:
             yield f"{onlooker.tag}: {ONLOOKERS[onlooker.right]} {enclave}"
 
 
-def _level_text(card: Card) -> str:
-    return "" if card.level is WireLevel.UNKNOWN else f", {LEVEL_NAMES[card.level]}"
+def _level_text(picture: Picture, card: Card) -> str:
+    return "" if card.level is WireLevel.UNKNOWN else f", {level_name(picture, card.level)}"
 
 
 def _link_label(picture: Picture, link: Link) -> str:
@@ -579,8 +581,8 @@ def _link_label(picture: Picture, link: Link) -> str:
 # ── DOT ────────────────────────────────────────────────────────────────────────────────────
 
 
-def _dot_node(scene: Scene, key: str, card: Card) -> str:
-    texts = [_dot_escaped(text) for text in _card_texts(scene, card)]
+def _dot_node(picture: Picture, scene: Scene, key: str, card: Card) -> str:
+    texts = [_dot_escaped(text) for text in _card_texts(picture, scene, card)]
     label = r"\l".join((*texts, "") if len(texts) > 1 else texts)
     shape = ", style=filled, fillcolor=white, shape=note" if card.role == "names" else ""
     return f'{_dot_quoted(key)} [label="{label}"{shape}]'
@@ -610,13 +612,13 @@ def _dot_escaped(text: str) -> str:
 # ── Mermaid ────────────────────────────────────────────────────────────────────────────────
 
 
-def _mermaid_node(scene: Scene, key: str, card: Card) -> str:
+def _mermaid_node(picture: Picture, scene: Scene, key: str, card: Card) -> str:
     around = '["{}"]' if card.role == "names" else '("{}")'
-    return _identifier(key) + around.format(_mermaid_label(scene, card))
+    return _identifier(key) + around.format(_mermaid_label(picture, scene, card))
 
 
-def _mermaid_label(scene: Scene, card: Card) -> str:
-    return "<br/>".join(map(_escaped_for_mermaid, _card_texts(scene, card)))
+def _mermaid_label(picture: Picture, scene: Scene, card: Card) -> str:
+    return "<br/>".join(map(_escaped_for_mermaid, _card_texts(picture, scene, card)))
 
 
 def _node_id(card: str) -> str:

@@ -47,7 +47,7 @@ _MOST_NAMES, _SHOWN_NAMES = 8, 4  # a card lists up to 8 names; if there are mor
 _SWEEPS = 24
 
 KIND_NAMES = {"topics": "topic", "services": "service", "actions": "action", "dds": "DDS topic"}
-LEVEL_NAMES = {
+_LEVEL_NAMES = {
     WireLevel.ENCRYPT: "encrypted",
     WireLevel.SIGN: "signed, readable",
     WireLevel.NONE: "not protected",
@@ -80,6 +80,13 @@ OWN, OTHERS = "own:", ("other of", "others of")
 """Words on cards that the legend explains."""
 _SENDERS, _LISTENERS = "may publish or call", "may subscribe or serve"
 _NAMES = "topics, services, actions"
+
+
+def level_name(picture: Picture, level: WireLevel) -> str:
+    """Return the text for a level of protection in a picture."""
+    if level is WireLevel.SIGN and picture.has_least_levels:
+        return "at least signed"
+    return _LEVEL_NAMES[level]
 
 
 class Head(NamedTuple):

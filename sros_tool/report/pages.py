@@ -141,6 +141,7 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
         "overlay": as_plain(picture.overlay),
         "of_every_node": OF_EVERY_NODE,
         "join_needs_right": picture.join_needs_right,
+        "has_least_levels": picture.has_least_levels,
         "enclaves": [_enclave_json(enclave) for enclave in picture.enclaves],
         **_bundles_json(bundles, [enclave.path for enclave in picture.enclaves]),
         "scenes": [_scene_json(scene) for scene in scenes],

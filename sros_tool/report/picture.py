@@ -550,6 +550,8 @@ class Picture:
     unread: tuple[UnreadUnits, ...] = ()
     join_needs_right: bool = False
     """Whether an enclave can join only the ROS domains in which it has a right."""
+    has_least_levels: bool = False
+    """Whether levels of protection are the least levels that a policy demands."""
 
     @property
     def headlines(self) -> tuple[str, ...]:

@@ -145,7 +145,7 @@ def test_a_table_says_which_names_move_or_are_protected(tmp_path: Path) -> None:
     for rights, rows, end in (
         ({"/a": relative, "/b": absolute}, ("`/width` (relative for some nodes) |",), legend),
         ({"/a": relative + action}, ("`/width` (relative) |", "`/grasp` (rel", "`/tf` |"), legend),
-        ({"/a": protected}, ("`/x` (relative; signed, readable) |", "`/y` (encrypted) |"), legend),
+        ({"/a": protected}, ("`/x` (relative; at least signed) |", "`/y` (encrypted) |"), legend),
         ({"/a": absolute}, (), "All names are absolute: the namespaces of"),
     ):
         (tmp_path / "p.xml").write_text(policy_text(rights))

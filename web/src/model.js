@@ -28,6 +28,7 @@ export class Model {
       scene.cards = rowsOf(scene.cards);
       scene.links = rowsOf(scene.links);
     }
+    if (data.has_least_levels) LEVELS.sign = "at least signed";
     this.enclave = new Map(data.enclaves.map((enclave) => [enclave.path, enclave]));
     this.bundleOf = new Map();
     this.tiesOf = new Map(data.enclaves.map((enclave) => [enclave.path, []]));
