@@ -75,6 +75,15 @@ _ENCLAVE_FILES = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
 _DATED_FILES = (CERTIFICATE_FILE, PERMISSIONS_FILE, PERMISSIONS_CA_FILE, *LIST_FILES)
 """The files that must not become older: with `sros import` or a play, newer ones may arrive."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+_MISSED_ROTATION = (
+    "If this robot missed a stage of a CA rotation, bring its files: `sros distribute_key KEYSTORE "
+    "--robot {} FOLDER --force`. If not, check whether the server has an old copy from before a "
+    "rotation."
+)
+_OF_OTHER_CA_AND_OLDER = (
+    "If the CAs were replaced, the server probably has an old copy from before that: publish there "
+    "again."
+)
 
 
 class DiskFullError(OSError):
@@ -239,22 +248,23 @@ def _check_release(
             "Bring the first enclave with `sros import` or an Ansible play, or name the "
             "permissions CA with `sros agent init --ca`.",
         )
-    if release.number < installed:
+    is_older = release.number < installed
+    # First the seal: the numbers of two keystores say nothing about each other.
+    if problem := seal_problem(release, trusted):
+        older = f"It is also older than release {installed}, {OLDER_THAN_INSTALLED}. "
+        raise KeystoreError(
+            f"release {release.number} {OF_OTHER_CA}",
+            f"{capitalized(problem).rstrip('.')}. {older if is_older else ''}Nothing was changed.",
+            (_OF_OTHER_CA_AND_OLDER if is_older else _MISSED_ROTATION.format(robot))
+            + " Otherwise the release comes from another keystore, or was changed: check the place "
+            "that `sros agent init --from` named, and find out who can write to the publishing "
+            "folder.",
+        )
+    if is_older:
         raise KeystoreError(
             f"release {release.number} is older than release {installed}, {OLDER_THAN_INSTALLED}",
             "The server has older files than this robot received before. Nothing was changed.",
             OLD_COPY,
-        )
-    if problem := seal_problem(release, trusted):
-        raise KeystoreError(
-            f"release {release.number} {OF_OTHER_CA}",
-            f"{capitalized(problem).rstrip('.')}. Nothing was changed.",
-            "If this robot missed a stage of a CA rotation, bring its files: `sros distribute_key "
-            f"KEYSTORE --robot {robot} FOLDER --force`. If not, check whether the server has an "
-            "old "
-            "copy from before a rotation. Otherwise the release comes from another keystore, or "
-            "was "
-            "changed: find out who can write to the publishing folder.",
         )
     with Folder(folder) as opened:
         usable = [name for name in present if _has_certificate(opened, name)]
