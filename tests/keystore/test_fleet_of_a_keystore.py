@@ -303,6 +303,18 @@ def test_requests_for_robots_that_the_keystore_does_not_know(made: Path, tmp_pat
     said = sros("sign_request", root, requests, *words, "--no-answer").ok().err
     assert said.count("note [fleet.unrecorded-enclaves]") == 1
     assert "which robot has /new, /other: its fleet does not have the robot" in said
+    sros("create_request", "/a/fork", tmp_path / "lift").ok()
+    lifts = "[groups]\nlifts = {}\n[robots]\n"
+    (tmp_path / "was.toml").write_text(f"{lifts}a = {{}}\n")
+    (tmp_path / "lifts.toml").write_text(f'{lifts}a = {{ groups = ["lifts"] }}\n')
+    (tmp_path / "lifts.xml").write_text(policy_text({"/{robot:lifts}/fork": publish("x")}))
+    (tmp_path / "all.xml").write_text(policy_text({"/{robot}": publish("x")}))
+    of_lifts = ("-p", tmp_path / "lifts.xml", "--fleet", tmp_path / "lifts.toml")
+    before = ("-p", tmp_path / "all.xml", "--fleet", tmp_path / "was.toml")
+    sros("generate_artifacts", "-k", tmp_path / "groups", *before).ok()
+    request = tmp_path / "lift/enclaves/a/fork/request.pem"
+    told = sros("sign_request", tmp_path / "groups", request, *of_lifts, "--no-answer").ok().err
+    assert "which robot has /a/fork: its fleet has the robot in other groups. So" in told
     sros("revoke", root, "/new").ok()
     refused = sros("generate_artifacts", "-k", root, *words)
     assert "remove the folder of each enclave on the robot (its key" in refused.err

@@ -18,7 +18,7 @@ from sros_tool.dds.permissions import name_notes
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.robots import Robot, robot_of
+from sros_tool.fleet.robots import Fleet, Robot, robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import pack
 from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
@@ -353,6 +353,20 @@ def _is_certified(keystore: OpenedKeystore, request: SigningRequest) -> bool:
     return keystore.certificate_of(request.name).public_key() == request.public_key
 
 
+def _not_recorded_clause(recorded: Fleet | None, stated: Robot | None) -> str:
+    """Return why a keystore's fleet, if there is one, does not give an enclave to its robot.
+
+    ``stated`` is the robot by the fleet file of the command.
+    """
+    if recorded is None:
+        return "it has no fleet"
+    robot = recorded.robots.get(stated.name) if stated else None
+    if stated is None or robot is None:
+        return "its fleet does not have the robot"
+    other = "in other groups" if robot.groups != stated.groups else "with another namespace"
+    return f"its fleet has the robot {other}"
+
+
 class _RequestCertifier:
     """The certification of requests within one change of a keystore."""
 
@@ -391,19 +405,18 @@ class _RequestCertifier:
             before = EnclaveDomains(change.domains, fleet)
             fleet = change.write_fleet(fleet, paths)
             refuse_stale_domains(change.keystore, before, fleet, stated)
-        unrecorded = [
-            name
-            for name, of_enclave in stated.items()
-            if of_enclave.path and not (fleet and robot_of(fleet, name))
-        ]
-        if unrecorded:
-            lacks = "its fleet does not have the robot" if fleet else "it has no fleet"
+        unrecorded: dict[str, list[str]] = {}
+        for name, of_enclave in stated.items():
+            if of_enclave.path and not (fleet and robot_of(fleet, name)):
+                why = _not_recorded_clause(fleet, of_enclave.robot)
+                unrecorded.setdefault(why, []).append(name)
+        for why, names in unrecorded.items():
             change.notes.append(
                 Note(
                     "fleet.unrecorded-enclaves",
-                    f"the keystore does not know which robot has {first_few(unrecorded, 3)}: "
-                    f"{lacks}. So `--robot`, as in `sros renew KEYSTORE --robot ROBOT`, does not "
-                    "choose such an enclave until you run `sros generate_artifacts -k "
+                    f"the keystore does not know which robot has {first_few(names, 3)}: {why}. "
+                    "So `--robot`, as in `sros renew KEYSTORE --robot ROBOT`, does not choose such "
+                    "an enclave until you run `sros generate_artifacts -k "
                     f"{quote(str(root))} -p POLICY_FILE --fleet FLEET_FILE`.",
                 )
             )
