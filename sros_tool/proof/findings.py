@@ -206,6 +206,9 @@ def decide_all(
 ) -> Decisions:
     """Return the decisions on requirements in all worlds.
 
+    An export shows only which requirements are broken: it may lack the enclaves that have the names
+    in a requirement, or that could break it.
+
     A violation of several enclaves begins with one that is not in ``breaking``.
 
     Raises:
@@ -224,7 +227,6 @@ def decide_all(
     known = {enclave for world in system.worlds for enclave in world.enclaves}
     demanded = [r.enclave for r in requirements if isinstance(r, Must) and r.enclave not in known]
     unjudged = tuple(dict.fromkeys(demanded)) if system.is_export else ()
-    lacks_enclaves = system.is_export or any(world.away for world in system.worlds)
     for requirement in requirements:
         if isinstance(requirement, Must) and requirement.enclave in unjudged:
             continue
@@ -249,29 +251,30 @@ def decide_all(
             violations.append(
                 Violation(requirement, witness, steps, titles, missing, idle, other_steps)
             )
-        empty, waiting, always = _why_never_fails([verdict for _, verdict in verdicts])
-        is_complete = not lacks_enclaves and _has_all_enclaves(requirement, system)
-        is_gone = (is_complete or not requirement.is_relative) and _texts_in_all(
-            verdict.gone for _, verdict in verdicts
-        )
-        if empty or is_gone or (always and not _users_may_break(requirement)):
-            vacuous.append((requirement, (*empty, *(waiting or always))))
-        elif (waiting or always) and not broken:
-            holding_alone.append((requirement, (*(waiting or always),)))
-        if not broken and not lacks_enclaves:
-            failing, alone = _unanswered_clauses(requirement, system, [v for _, v in verdicts])
-            if failing:
-                unanswered.append((requirement, failing))
-            if alone:
-                unanswered_alone.append((requirement, alone))
-        exceptions = _texts_in_all(verdict.absent for _, verdict in verdicts)
-        meant = {name: similar_enclave_clause(name, known) for name in exceptions}
-        if misspelled_names := [f"{name}{clause}" for name, clause in meant.items() if clause]:
-            misspelled.append((requirement, (_no_enclave_clause(misspelled_names),)))
-        if absent_names := [name for name, clause in meant.items() if not clause]:
-            absent.append((requirement, (_no_enclave_clause(absent_names),)))
-        if not broken and (names := _texts_in_all(verdict.unnamed for _, verdict in verdicts)):
-            unnamed.append((requirement, names))
+        if not system.is_export:  # the enclaves that it lacks may have the names
+            empty, waiting, always = _why_never_fails([verdict for _, verdict in verdicts])
+            is_complete = _has_all_enclaves(requirement, system)
+            is_gone = (is_complete or not requirement.is_relative) and _texts_in_all(
+                verdict.gone for _, verdict in verdicts
+            )
+            if empty or is_gone or (always and not _users_may_break(requirement)):
+                vacuous.append((requirement, (*empty, *(waiting or always))))
+            elif (waiting or always) and not broken:
+                holding_alone.append((requirement, (*(waiting or always),)))
+            if not broken:
+                failing, alone = _unanswered_clauses(requirement, system, [v for _, v in verdicts])
+                if failing:
+                    unanswered.append((requirement, failing))
+                if alone:
+                    unanswered_alone.append((requirement, alone))
+            exceptions = _texts_in_all(verdict.absent for _, verdict in verdicts)
+            meant = {name: similar_enclave_clause(name, known) for name in exceptions}
+            if misspelled_names := [f"{name}{clause}" for name, clause in meant.items() if clause]:
+                misspelled.append((requirement, (_no_enclave_clause(misspelled_names),)))
+            if absent_names := [name for name, clause in meant.items() if not clause]:
+                absent.append((requirement, (_no_enclave_clause(absent_names),)))
+            if not broken and (names := _texts_in_all(verdict.unnamed for _, verdict in verdicts)):
+                unnamed.append((requirement, names))
         if not broken and (
             assumed_names := [verdict.assumed for _, verdict in verdicts if verdict.assumed]
         ):

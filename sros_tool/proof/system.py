@@ -36,7 +36,6 @@ from sros_tool.keystore.layout import (
     enclaves_of_closed_robot,
     has_zenoh_files,
     is_keystore,
-    is_original_keystore,
 )
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, deciding_enclave
 from sros_tool.keystore.protection import governance_with_stated_protections
@@ -474,7 +473,7 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
         on_zenoh = list(_zenoh_worlds(keystore, at.domain, stated))
         _link_domains(on_zenoh)
         worlds += on_zenoh
-    is_export = not is_original_keystore(root)
+    is_export = not keystore.has_all_enclaves
     for world in worlds if is_export else ():
         world.away = enclaves_of_closed_robot(root).elsewhere
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}

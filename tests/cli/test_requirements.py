@@ -195,6 +195,34 @@ def test_an_export_is_judged_without_the_enclaves_that_it_lacks(tmp_path: Path) 
     assert "[requirement.of-export]" in ended.out and "nothing found" not in ended.err
     assert "Check the keystore that the export comes from." in ended.out
     assert "of-export" not in sros("check", "ks", *asked, cwd=tmp_path).out
+    # What only the missing enclaves would have is not found; twin: what the export breaks.
+    of_others = """
+[[only]]
+call = ["/dock"]
+enclaves = ["/planner", "/web"]
+[[only]]
+publish = ["/cmd_vel"]
+enclaves = ["/mux", "/teleop"]
+[[at_most]]
+publish = ["/cmd_vel"]
+enclaves = 2
+[[apart]]
+from = ["/planner"]
+to = ["/wheels"]
+[[nobody]]
+publish = ["/cmd_vle"]
+"""
+    (tmp_path / "required.toml").write_text(of_others)
+    ended = sros("check", "robot", *asked, "--severity", "note", cwd=tmp_path).ok()
+    assert set(re.findall(r"\[(requirement\..*)]", ended.out)) == {"requirement.of-export"}
+    (tmp_path / "required.toml").write_text(of_others.replace('"/mux", ', ""))
+    ended = sros("check", "robot", *asked, cwd=tmp_path)
+    assert "may publish /cmd_vel" in ended.out and "[requirement.violated]" in ended.out
+    # Twin: a copy of the whole keystore, without its keys and its ledger.
+    shutil.copytree(tmp_path / "ks" / "enclaves", tmp_path / "copy" / "enclaves")
+    shutil.copytree(tmp_path / "ks" / "public", tmp_path / "copy" / "public")
+    ended = sros("check", "copy", *asked, cwd=tmp_path)
+    assert "[requirement.vacuous]" in ended.out and "of-export" not in ended.out
     demand = '[[must]]\nenclave = "%s"\npublish = ["/cmd_vel"]\n'
     (tmp_path / "required.toml").write_text(demand % "/web")
     ended = sros("check", "robot", *asked, cwd=tmp_path).ok()

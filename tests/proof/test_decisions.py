@@ -426,6 +426,8 @@ def test_an_exception_for_an_enclave_that_does_not_exist(required: str, ids: set
     system = robot(PACKAGE)
     requirements = parse_requirements(required.encode(), "r.toml")
     found = requirement_findings(requirements, system)
+    of_export = requirement_findings(requirements, replace(system, is_export=True))
+    assert {finding.id for finding in of_export} == {"requirement.of-export", *ids & {VIOLATED}}
     assert {finding.id for finding in found} == ids and len(found) == len(ids)
     advised = ["write [[only]]" in finding.remedy for finding in found if finding.id == VACUOUS]
     assert advised == [not required.startswith("[[only]]")] * (VACUOUS in ids)
@@ -596,7 +598,7 @@ def test_a_right_that_nobody_has_any_more_on_a_robot(
     assert found(package, replace(system, is_keystore=True)) == on_robot
     assert found(package, system) == [ALONE]
     assert found(at_n, replace(system, is_package=True)) == [ALONE]
-    assert found(at_n, replace(system, is_export=True)) == [ALONE]
+    assert found(at_n, replace(system, is_export=True)) == []
     assert not found(at_n, robot({**kept, "/n/a": may(right, "/n/old")}))
 
 
