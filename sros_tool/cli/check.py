@@ -168,7 +168,7 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     "--template",
     metavar="TEMPLATE",
     shell_complete=complete_template,
-    help="With --requirements or --suggest: assume the protection of this keystore template.",
+    help="For policies that are not signed yet: assume a keystore of this template.",
 )
 @click.option(
     "--suggest",
@@ -365,8 +365,10 @@ def check(
             text = _suggested_requirements(systems[0], _load_system(systems[0], at, template))
         echo_document(text)
         return 0
-    if template and not requirements:
-        raise UsageError("--template is for --requirements and --suggest", "", "Leave it out.")
+    if template and not requirements and not _are_policies(family, paths):
+        raise UsageError(
+            "--template is for policies that are not signed yet", "", "Leave it out, or name one."
+        )
     if earlier and not requirements:
         raise UsageError(
             "--requirements-before needs --requirements", "", "Add --requirements CURRENT_FILE."
@@ -476,6 +478,12 @@ def _is_option_given(parameter: str) -> bool:
     """Return whether the user gave this parameter's option on the command line."""
     source = click.get_current_context().get_parameter_source(parameter)
     return source is ParameterSource.COMMANDLINE
+
+
+def _are_policies(family: str, paths: tuple[Path, ...]) -> bool:
+    from sros_tool.keystore.layout import is_keystore
+
+    return family in ("", "policy") and bool(paths) and not any(map(is_keystore, paths))
 
 
 def _policies_or_keystore(family: str, paths: tuple[Path, ...], option: str) -> list[Path]:

@@ -292,7 +292,7 @@ def test_two_enclaves_with_a_right_are_proposed_by_name(tmp_path: Path) -> None:
         (("robot.xml", "--requirements", "robot.xml"), "not valid TOML"),
         (("required.toml", "--requirements", "required.toml"), "required.toml"),
         (("robot.xml", "--requirements-before", "required.toml"), "needs --requirements"),
-        (("robot.xml", "--template", "production"), "--template is for --requirements"),
+        (("runtime", "--template", "production"), "--template is for policies that are not"),
         (("robot.xml", "--suggest", "--json"), "--suggest prints TOML"),
         (("robot.xml", "--suggest", "--requirements", "required.toml"), "--suggest prints TOML"),
     ],
@@ -519,6 +519,9 @@ def test_a_template_mends_names_that_it_makes_unique(tmp_path: Path) -> None:
         for template in ("development", "production")
     }
     assert found == {"development": True, "production": False}
+    assert "[portable.enclave-names]" in sros("check", "robot.xml", cwd=tmp_path).out
+    ended = sros("check", "robot.xml", "--template", "production", cwd=tmp_path)
+    assert "policy.no-rosout" in ended.out and "portable.enclave-names" not in ended.out
     for template in found:
         sros("create_keystore", tmp_path / template, "--template", template).ok()
         made = sros("create_enclave", tmp_path / template, "/arm", "/left/arm").ok()

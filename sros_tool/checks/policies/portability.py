@@ -88,7 +88,8 @@ ENCLAVE_NAMES = FindingKind(
     "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c); reproduced: readers received data of such "
     "an enclave.",
     "Rename an enclave so that its path has a part that the other path lacks, such as "
-    "/robot_admin, or choose unique subjects (template production).",
+    "/robot_admin, or use a keystore with unique subjects, such as one of the template production: "
+    "then check the policy with `--template production`.",
     vendors=CYCLONE_DDS,
 )
 SEVERAL_PROFILES = FindingKind(
