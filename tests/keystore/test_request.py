@@ -523,6 +523,10 @@ def test_a_policy_without_the_enclave_is_refused(home: Path, robot: Path, tmp_pa
     (tmp_path / "p.xml").write_text(policy_text({"/x": publish("y")}))
     with pytest.raises(PolicyError, match="unable to find enclave /arm/camera"):
         sign_request(home, request_of(robot), now=NOW, policy=read_policy(tmp_path / "p.xml"))
+    names = (*(f"/x{number}" for number in range(9)), "/arm/cameras")
+    (tmp_path / "p.xml").write_text(policy_text(dict.fromkeys(names, publish("y"))))
+    with pytest.raises(PolicyError, match=r"The policy has 10 enclaves, such as /arm/cameras\.$"):
+        sign_request(home, request_of(robot), now=NOW, policy=read_policy(tmp_path / "p.xml"))
 
 
 def test_the_answer_appears_with_the_keystore_or_not_at_all(

@@ -84,6 +84,8 @@ from sros_tool.xml import read_bytes
 Result = TypeVar("Result")
 
 _LEAST_NOTED_LOSS = 0.01
+_MOST_SHOWN = 5
+"""Maximum number of enclaves of a policy that an error names."""
 
 
 # ── keys on tokens ─────────────────────────────────────────────────────────────────────────
@@ -514,10 +516,16 @@ def stated_enclave(policy: Policy, name: str) -> Enclave:
     """
     enclave = policy.enclave(name)
     if enclave is None:
-        present = ", ".join(enclave.path for enclave in policy.enclaves)
+        paths = [enclave.path for enclave in policy.enclaves]
+        present = ", ".join(paths) or "no enclaves"
+        if len(paths) > _MOST_SHOWN:
+            from difflib import get_close_matches  # imported only for this error
+
+            similar = get_close_matches(name, paths, _MOST_SHOWN) or paths[:_MOST_SHOWN]
+            present = f"{len(paths)} enclaves, such as {', '.join(similar)}"
         raise PolicyError(
             f"unable to find enclave {name} in the policy '{policy.file}'",
-            f"The policy has {present or 'no enclaves'}.",
+            f"The policy has {present}.",
         )
     return enclave
 
