@@ -427,9 +427,9 @@ def _show_end(
             if not process.is_by_hand and process.enclave in closed.denied_remappings:
                 echo(_remapping_text(closed, process.enclave))
     for proof in closed.proofs:
-        word = proof.acceptance
-        accept = f" (--accept {word} accepts this)" if word else ""
-        if word in accepted:
+        words = [f"--accept {word}" for word in proof.acceptances]
+        accept = f" ({' or '.join(words)} accepts this)" if words else ""
+        if not accepted.isdisjoint(proof.acceptances):
             accept = " (accepted)"
         answer = _ANSWERS[proof.holds]
         if proof.holds and proof.denied:

@@ -57,7 +57,7 @@ from sros_tool.keystore.expiry import renewal_command, survey
 from sros_tool.keystore.layout import KEY_FILES, enclave_path, list_enclaves
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.proof.requirements import Must, read_requirements
-from sros_tool.runtime.processes import Process
+from sros_tool.runtime.processes import Process, RunningProcesses
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.validity import iso
 from sros_tool.wording import counted, enumerated, first_few
@@ -358,7 +358,8 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
 
     Yields nothing if at most one process has shared memory ports of Fast DDS that sros sees.
     Waits until all processes have connected, or had enough time. Processes that may not belong to
-    the robot leave the claim untested if they have not connected.
+    the robot leave the claim untested if they have not connected, as do processes that use ROS 2
+    and cannot be examined.
     """
     own, others = _connecting_processes(RunningRobot(robot))
     started = [process.started for process in (*own, *others)]
@@ -387,11 +388,34 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
             "of Fast DDS with them: look at what each process receives now, and restart a process "
             "that receives nothing",
         )
+    elif connections.compared and (text := _unexamined_text(running.processes)):
+        yield Proof(CONNECTED, None, text, unexamined=True)
     elif len(connections.compared) > 1:
         number = counted(len(connections.compared), "process", "processes")
         reason = f"{number} of Fast DDS, each with all others"
         reason += "; sros cannot see processes on other machines" * bool(robot.not_here)
+        # Their commands do not show whether they use ROS 2.
+        reason += "; without processes that sros could not examine" * bool(running.processes.unseen)
         yield Proof(CONNECTED, True, reason)
+
+
+def _unexamined_text(running: RunningProcesses) -> str:
+    """Return text on the processes that may be deaf and cannot be examined; "" without any.
+
+    Those that may not use ROS 2 are left out.
+    """
+    unseen = [process.label for process in running.unseen if process.uses_ros]
+    names = [first_few(unseen, MOST_NAMES)] * bool(unseen)
+    names += ["processes that /proc hides"] * bool(running.hidden)
+    if not names:
+        return ""
+    is_one = len(unseen) == 1 and not running.hidden
+    hear, they = ("hears", "it") if is_one else ("hear", "they")
+    return (
+        f"sros cannot see whether {enumerated(names)} {hear} the others, because {they} could not "
+        "be examined: "
+        "run the proof as root, outside of containers"
+    )
 
 
 def _connecting_processes(running: RunningRobot) -> tuple[list[Process], list[Process]]:
@@ -527,7 +551,8 @@ def _proof_of_processes(
             text = f"true for {number}; {text}: they may run open, or with a copied key"
     else:
         text += "".join(f"; {guest}" for guest in _texts_of_all(_open_in_other_domains, looks))
-    return Proof(STARTED, False if wrong else None if findings else True, text)
+    holds = False if wrong else None if findings else True
+    return Proof(STARTED, holds, text, unexamined=holds is None)
 
 
 def _texts_of_all(

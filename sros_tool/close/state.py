@@ -82,7 +82,6 @@ _NEGATIONS = {
     SILENCE: "an open listener finds something",
 }
 _ACCEPTANCES = {
-    STARTED: Acceptance.UNEXAMINED,
     KNOWN: Acceptance.UNOBSERVED,
     ALONE: Acceptance.DOMAINS,
     REQUIRED: Acceptance.REQUIREMENTS,
@@ -573,6 +572,8 @@ class Proof(NamedTuple):
     """What else was seen, as clauses, such as rights that no node used, and new nodes; also what
     sros cannot see, such as whether two nodes hear each other.
     """
+    unexamined: bool = False
+    """Whether the claim could not be tested because sros could not examine processes."""
 
     @property
     def fails(self) -> bool:
@@ -585,13 +586,15 @@ class Proof(NamedTuple):
         return _NEGATIONS[self.claim] if self.fails else self.claim
 
     @property
-    def acceptance(self) -> Acceptance | None:
-        """What ``--accept`` has to name so that the claim need not be tested.
+    def acceptances(self) -> Sequence[Acceptance]:
+        """What ``--accept`` may name, one of these, so that the claim need not be tested.
 
-        It is None if the claim was tested, and for claims that need an observer of the running
+        It is empty if the claim was tested, and for claims that need an observer of the running
         robot.
         """
-        return _ACCEPTANCES.get(self.claim) if self.holds is None else None
+        words = [Acceptance.UNEXAMINED] * self.unexamined
+        words += [_ACCEPTANCES[claim] for claim in (self.claim,) if claim in _ACCEPTANCES]
+        return words if self.holds is None else []
 
 
 @shows(spread=("observed",))
@@ -677,7 +680,9 @@ class CloseState(NamedTuple):
 
     def is_proved(self, accepted: Acceptances) -> bool:
         """Return whether the proof holds; ``accepted`` claims need not have been tested."""
-        claims = [proof.holds or proof.acceptance in accepted for proof in self.proofs]
+        claims = [
+            proof.holds or not accepted.isdisjoint(proof.acceptances) for proof in self.proofs
+        ]
         return bool(claims) and all(claims)
 
     @property

@@ -29,7 +29,7 @@ from sros_tool.keystore.expiry import Lifetime
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
-from sros_tool.runtime.processes import Process, ProcessEnclave
+from sros_tool.runtime.processes import Process, ProcessEnclave, RunningProcesses, UnseenProcess
 from sros_tool.validity import Window
 from tests.checks.test_connections import robot
 from tests.close.test_assignment import node
@@ -120,11 +120,11 @@ def test_requirements_hold_if_they_hold_here_and_elsewhere(
     assert said.holds is holds
     weak = "; but with 1 warning that a requirement protects less than it states, the first: line 7"
     assert (f"{weak}: no enclave /x" in said.reason) is bool(holds)
-    assert said.acceptance == (Acceptance.REQUIREMENTS if holds is None else None)
+    assert said.acceptances == [Acceptance.REQUIREMENTS] * (holds is None)
     required.unlink()
     said = _proof_of_requirements(robot, str)
     assert (
-        said.acceptance is Acceptance.REQUIREMENTS
+        said.acceptances == [Acceptance.REQUIREMENTS]
         and f"{required} is missing; restore it" in said.reason
     )
 
@@ -153,6 +153,8 @@ FOREIGN = 10
 """The id of a process that trusts another CA."""
 STOLEN = 11
 """The id of a process with other files; its certificate is revoked, as those of higher ids are."""
+OF_ROS, UNKNOWN = 20, 21
+"""The ids of processes that cannot be examined; the command of the first shows that it uses ROS."""
 
 
 @pytest.mark.parametrize(
@@ -198,6 +200,16 @@ STOLEN = 11
         (robot(12, 13, OF_OTHERS, deaf=[(12, OF_OTHERS)]), (), None, "process 9 (node9) may also"),
         ([replace(process, own_ports=frozenset()) for process in robot(1, 2)], (), None, None),
         (robot(1), (), None, None),
+        (
+            robot(1, 2, OF_ROS),
+            (),
+            None,
+            "sros cannot see whether process 20 (node20) hears the others, because it could not be "
+            "examined: run the proof as root",
+        ),
+        (robot(1, OF_ROS), (), None, "process 20 (node20) hears the others"),
+        (robot(1, 2, OF_ROS, deaf=[(1, 2)]), (), False, "do not hear each other"),
+        (robot(1, 2, UNKNOWN), (), True, "; without processes that sros could not examine"),
     ],
 )
 def test_processes_that_have_not_connected_fail_the_proof(
@@ -215,9 +227,16 @@ def test_processes_that_have_not_connected_fail_the_proof(
     in_domain = [
         replace(process, enclave=ProcessEnclave(f"/export{process.pid}", "/node"))
         for process in processes
+        if process.pid < OF_ROS
+    ]
+    unseen = [
+        UnseenProcess(process.pid, process.command, "hidden", process.pid == OF_ROS)
+        for process in processes
+        if process.pid >= OF_ROS
     ]
     running: Any = SimpleNamespace(
         in_domain=in_domain,
+        processes=RunningProcesses(unseen=tuple(unseen)),
         secured=[
             (process, process.enclave)
             for process in in_domain
@@ -240,7 +259,8 @@ def test_processes_that_have_not_connected_fail_the_proof(
     assert (says or "") in "".join(said.reason for said in proofs)
     for said in proofs:
         is_unseen = said.holds is None
-        assert said.acceptance == (Acceptance.CONNECTIONS if is_unseen else None)
+        assert said.acceptances[-1:] == [Acceptance.CONNECTIONS] * is_unseen
+        assert (Acceptance.UNEXAMINED in said.acceptances) is ("not be examined" in said.reason)
 
 
 def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command() -> None:
