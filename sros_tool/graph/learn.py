@@ -56,6 +56,7 @@ from sros_tool.policy.merge import (
     Merged,
     PlacedElement,
     counterpart_notes,
+    kept_rights_notes,
     merge_all,
     merge_into,
 )
@@ -1089,6 +1090,8 @@ def merge_policies(
     added = (stated for addition in additions for stated in stated_protections(addition.enclaves))
     refuse_contradictions((*protections, *added), known=protections)
     notes += (*merged.notes, *counterpart_notes(present, stated, merged.rights))
+    if not any(note.id == "merge.earlier-names" for note in notes):
+        notes += kept_rights_notes(present, additions, merged.added)
     document = merged.document
     if merged.added and may_include:
         document = _with_common_parts(path, document, additions)

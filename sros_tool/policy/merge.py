@@ -267,6 +267,39 @@ def counterpart_notes(
         yield Note("merge.no-counterpart", text)
 
 
+def kept_rights_notes(
+    before: Policy, additions: Iterable[Policy], added: Collection[Right]
+) -> Iterator[Note]:
+    """Yield a note on rights that nodes keep in ``before``, although ``additions`` lack them.
+
+    Probably an earlier version of the nodes had these rights.  Only nodes count that get a right,
+    and that already have one of the rights of ``additions``.  A policy with only missing rights, as
+    `sros explain --log` prints it, is thus no reason for a note.
+    """
+    requested = defaultdict[tuple[str, str], set[Right]](set)
+    for addition in additions:
+        for enclave in addition.enclaves:
+            for node, rights in _rights_of_nodes(enclave).items():
+                requested[enclave.path, node] |= rights
+    is_added, kept = {*added}, set[Right]()
+    for enclave in before.enclaves:
+        for node, rights in _rights_of_nodes(enclave).items():
+            asked = requested.get((enclave.path, node), set())
+            own = {right for right in rights if not _is_of_any_node(right)}
+            if asked.isdisjoint(is_added) or asked.isdisjoint(own):
+                continue
+            asked_rules = Rules(asked)
+            kept |= {right for right in own if not asked_rules.overlaps(right)}
+    if kept:
+        shown = (f"{right.enclave} {right.describe()}" for right in sorted(kept, key=order))
+        text = (
+            f"rights stay that the merged policy does not give: {first_few([*shown], _MOST_SHOWN)}."
+            " If only an earlier version of the merged policy gave them, take them out, or merge "
+            "into the policy without this package."
+        )
+        yield Note("merge.kept-rights", text)
+
+
 _MARKUP = re.compile(
     r"<!--.*?-->|<\?.*?\?>|<!\[CDATA\[.*?\]\]>"
     r"|</(?P<close>[^ \t\r\n>]+)[ \t\r\n]*>"
