@@ -324,6 +324,20 @@ def test_requests_for_robots_that_the_keystore_does_not_know(made: Path, tmp_pat
     shutil.rmtree(folder)
     sros("create_request", "/new", tmp_path / "robot").ok()
     sros(*sign, "--enclave", "/new").ok()
+    assert "key-made-here" not in sros("generate_artifacts", "-k", root, *words).ok().err
+    (tmp_path / "more.xml").write_text(policy_text({"/{robot}/more": publish("x")}))
+    more = ("-p", tmp_path / "more.xml", "--fleet", tmp_path / "fleet.toml")
+    for dry_run in (["--dry-run"], []):
+        told = sros("generate_artifacts", "-k", root, *more, "--robot", "new", *dry_run).ok().err
+        assert told.count("note [enclave.key-made-here]") == 1
+        assert "makes the key of /new/more, but its robot made all other keys. To" in told
+        assert f"revoke it with `sros revoke {root} /new/more`, run `sros create_req" in told
+    sros("revoke", root, "/new/more").ok()
+    sros("create_request", "/new/more", tmp_path / "robot").ok()
+    request = tmp_path / "robot/enclaves/new/more/request.pem"
+    sros("sign_request", root, request, "--no-answer", *more, "--enclave", "/new/more").ok()
+    again = sros("generate_artifacts", "-k", root, *more, "--robot", "new").ok()
+    assert "key-made-here" not in again.err and "unchanged: 1 enclave: /new/more" in again.err
 
 
 def test_many_enclaves_are_counted_with_the_next_step(tmp_path: Path) -> None:
@@ -361,6 +375,7 @@ def test_a_robot_with_keys_of_its_own_gets_all_files_after_a_rotation(
     sros("create_request", "/a/own", robot).ok()
     request = robot / "enclaves/a/own/request.pem"
     sros("sign_request", root, request, "--no-answer", *words, "--enclave", "/a/own").ok()
+    assert "key-made-here" not in sros("generate_artifacts", "-k", root, *words).ok().err
     copy = tmp_path / "copy"
     for target in (robot, copy):
         said = sros("distribute_key", root, "--robot", "a", target, "--force").ok().err

@@ -25,7 +25,7 @@ from sros_tool.dds.governance import Governance, parse_governance, render_govern
 from sros_tool.dds.permissions import name_notes, parse_permissions
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageError, check_meaning
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.fleet.robots import Fleet, Robot, robot_of
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
 from sros_tool.keystore.delivery.published import may_have_later_releases, read_published
 from sros_tool.keystore.delivery.restored import (
@@ -44,6 +44,7 @@ from sros_tool.keystore.fleet import (
     lost_enclaves,
     publish_command,
     refuse_stale_domains,
+    revoke_command,
     unrecorded_notes,
 )
 from sros_tool.keystore.issuing.acceptance import imported_ca_notes
@@ -387,6 +388,7 @@ def _expired_enclaves(change: KeystoreChange, names: Iterable[str]) -> Iterator[
 def creation(change: KeystoreChange, rights: tuple[ReplacedRights, ...]) -> Creation:
     """Return the result of a change that created or changed enclaves."""
     change.notes += unrecorded_notes(change.keystore, change.fleet, change.outcomes)
+    change.notes += _keys_made_here_notes(change)
     return change.result(
         Creation,
         rights=rights,
@@ -394,6 +396,36 @@ def creation(change: KeystoreChange, rights: tuple[ReplacedRights, ...]) -> Crea
         domains=change.domains,
         new_keystore=change.is_new,
     )
+
+
+def _keys_made_here_notes(change: KeystoreChange) -> Iterator[Note]:
+    """Yield a note on new keys for robots whose other keys were all made on the robot."""
+    fleet, keystore = change.fleet, change.keystore
+    if not fleet:
+        return
+    created: dict[str, list[str]] = {}
+    for name, outcome in change.outcomes.items():
+        if outcome == "created" and (robot := robot_of(fleet, name)):
+            created.setdefault(robot.name, []).append(name)
+    made_here: list[str] = []
+    for robot_name, names in created.items():
+        existing = enclaves_of_robot(keystore, fleet, fleet.robots[robot_name])
+        others = [keystore.folder(name) for name in existing if name not in names]
+        if others and all(map(key_on_robot, others)):
+            made_here += names
+    if made_here:
+        is_one = len(made_here) == 1
+        key, its, it = ("key", "its robot", "it") if is_one else ("keys", "their robots", "them")
+        yield Note(
+            "enclave.key-made-here",
+            f"the keystore machine makes the {key} of {first_few(sorted(made_here), _MOST_SHOWN)}, "
+            f"but {its} made all other keys. To have {it} made there, too, revoke "
+            f"{it} with {revoke_command(keystore, sorted(made_here))}, run `sros create_request` "
+            "on the robot, and pass the request to `sros sign_request "
+            f"{quote(str(keystore.root))} REQUEST --no-answer -p POLICY_FILE --fleet FLEET_FILE "
+            f"--enclave {made_here[0] if is_one else 'ENCLAVE'}` (docs/howto/own_keys.md: New "
+            "enclaves).",
+        )
 
 
 def _enclaves_with_protection(policies: Sequence[Policy | FleetPolicy]) -> Iterator[Enclave]:
