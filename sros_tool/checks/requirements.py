@@ -151,7 +151,10 @@ NOT_ON_ZENOH = FindingKind(
     "requirement.not-on-zenoh",
     NOTE,
     "requirements were not checked for Zenoh",
-    "The policy cannot be translated to Zenoh, so its access on Zenoh is not known.",
+    "The policy cannot be translated to Zenoh, or the export lacks the router.json5, which shows "
+    "what Zenoh enforces. So the access on Zenoh is not known: a requirement may be broken there.",
     "zenoh.io, Access Control.",
-    "Ignore this if the robot uses DDS.",
+    "Ignore this if the robot uses DDS. Otherwise, change the policy; for an export, check the "
+    "keystore that it comes from.",
+    prominent=True,
 )

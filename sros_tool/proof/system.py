@@ -94,7 +94,8 @@ class System:
     ``file`` is the path, ``rights`` are the allowed rights as stated, and ``places`` finds the
     places that state rights. ``is_keystore`` says that the source is a keystore or an export, and
     ``is_export`` that it is an export, which may lack enclaves of its keystore. ``left_out`` is the
-    reason why there is no Zenoh world, if Zenoh cannot enforce the policy. ``fleet`` returns the
+    reason why there is no Zenoh world, if Zenoh cannot enforce the policy, or if an export lacks
+    the router's file. ``fleet`` returns the
     robots of the policy or keystore, or None. ``is_package`` says that a review tries the policy of
     a package in a namespace that users could choose.
     """
@@ -119,7 +120,8 @@ def load_system(
         path: the keystore; or policies and folders of policies, which count as one policy.
         at: the moment, the time zone of robots, the ROS domain (for a keystore, None stands for all
             domains), the fleet, and the vendors of the wanted worlds, from `WORLDS`. A keystore
-            without Zenoh configurations has no Zenoh world.
+            without Zenoh configurations has no Zenoh world, and neither has an export without the
+            file of a router, unless only Zenoh is wanted.
         template: the template of the keystore for which a policy is meant.
 
     Raises:
@@ -469,11 +471,14 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
         )
     for first in range(0, len(worlds), len(domains)):
         _link_domains(worlds[first : first + len(domains)])  # the worlds of one vendor
+    is_export, left_out = not keystore.has_all_enclaves, None
     if _ZENOH in at.vendors or (not at.vendors and has_zenoh_files(root, hidden=True)):
-        on_zenoh = list(_zenoh_worlds(keystore, at.domain, stated))
+        left_out = _missing_router_error(root, names) if is_export else None
+        if left_out and at.vendors:
+            raise left_out
+        on_zenoh = [] if left_out else list(_zenoh_worlds(keystore, at.domain, stated))
         _link_domains(on_zenoh)
         worlds += on_zenoh
-    is_export = not keystore.has_all_enclaves
     for world in worlds if is_export else ():
         world.away = enclaves_of_closed_robot(root).elsewhere
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}
@@ -486,9 +491,21 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
         tuple(worlds),
         Places(places),
         rights,
+        left_out,
         fleet=partial(checked_fleet, keystore),
         is_export=is_export,
         is_keystore=True,
+    )
+
+
+def _missing_router_error(export: Path, names: Iterable[str]) -> KeystoreError | None:
+    """Return the error that no enclave of an export has the file of a router, or None."""
+    if any((enclave_path(export, name) / ROUTER_FILE).is_file() for name in names):
+        return None
+    return KeystoreError(
+        f"nothing was decided for Zenoh, because export '{export}' has no {ROUTER_FILE}",
+        "Only this file shows which rights Zenoh enforces.",
+        "Check the keystore that the export comes from, or name a DDS vendor with --vendor.",
     )
 
 

@@ -223,6 +223,19 @@ publish = ["/cmd_vle"]
     shutil.copytree(tmp_path / "ks" / "public", tmp_path / "copy" / "public")
     ended = sros("check", "copy", *asked, cwd=tmp_path)
     assert "[requirement.vacuous]" in ended.out and "of-export" not in ended.out
+    # Without the router, nothing shows what Zenoh enforces, and the result says so.
+    for line in ("zenoh ks", "distribute_key ks /mux /wheels peers"):
+        sros(*line.split(), cwd=tmp_path).ok()
+    ended = sros("check", "peers", *asked, cwd=tmp_path)
+    assert ended.status == 1 and "[requirement.violated]" in ended.out
+    assert "nothing was decided for Zenoh, because export 'peers' has no" in ended.out
+    ended = sros("check", "peers", *asked, "--vendor", "zenoh", cwd=tmp_path)
+    assert ended.status == 2 and "name a DDS vendor with --vendor" in ended.err
+    ended = sros("check", "peers", *asked, "--vendor", "fastdds", cwd=tmp_path)
+    assert ended.status == 1 and "not-on-zenoh" not in ended.out
+    sros("distribute_key", "ks", "/router", "peers", cwd=tmp_path).ok()
+    ended = sros("check", "peers", *asked, cwd=tmp_path)
+    assert ended.status == 1 and "not-on-zenoh" not in ended.out
     demand = '[[must]]\nenclave = "%s"\npublish = ["/cmd_vel"]\n'
     (tmp_path / "required.toml").write_text(demand % "/web")
     ended = sros("check", "robot", *asked, cwd=tmp_path).ok()
