@@ -906,6 +906,8 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         confirmed = f"confirmed by {'all ' * (robots > 1)}{counted(robots, 'robot')}"
         if behind := status.unconfirmed:
             confirmed = f"not confirmed by {first_few(behind, 3)} yet"
+            clause = _shared_keys_clause(status, behind)
+            confirmed += f"; {clause}" if clause else ""
         yield f"CA rotation: {status.stage}; {confirmed}"
     yield from _revocation_list_facts(compared_fleet)
     yield from _expiry_facts(compared_fleet)
@@ -921,16 +923,24 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         )
 
 
+def _shared_keys_clause(status: FleetStatus, names: Collection[str]) -> str:
+    from sros_tool.keystore.fleet_status import shared_keys_clause
+
+    robots = [robot for robot in status.robots if robot.robot in names]
+    return shared_keys_clause([robot.robot for robot in robots if robot.has_shared_keys])
+
+
 def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield which robots have the revocation list in force, or lack it, if a list exists."""
     status = compared_fleet.status
     numbers = _counts_of_list_in_force(status)
     if numbers and (trusting := status.trusting_replaced):
         until_clause = f" (until {until:%Y-%m-%d})" if (until := status.revoked_until) else ""
+        clause = _shared_keys_clause(status, trusting)
         yield (
             f"{first_few(trusting, 5)} may still trust a replaced CA, and accept its revoked "
             f"certificates{until_clause}; the present CA has no revoked certificates"
-        )
+        ) + (f"; {clause}" if clause else "")
     elif numbers:
         in_force, robots = numbers
         number = f"{in_force} of " if in_force < robots else "all " if in_force > 1 else ""

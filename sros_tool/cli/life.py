@@ -42,7 +42,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.terminal import echo
-from sros_tool.wording import first_few, serial_text
+from sros_tool.wording import capitalized, first_few, serial_text
 
 if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
@@ -550,7 +550,6 @@ def rotate_ca(
       retired the old CA: identity_ca, permissions_ca
       $ sros rotate_ca keystore --finish   # or all together; then restart all
     """
-    from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import IDENTITY, PERMISSIONS
     from sros_tool.keystore.lifecycle.rotate import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotate import rotate_ca as work
@@ -564,7 +563,7 @@ def rotate_ca(
     if not (go_on or to or finish or same_key):
         keystore = OpenedKeystore(root)
         status_now = rotation_status(keystore, now=now())
-        _show_status(status_now, _unconfirmed_robots(keystore), as_json)
+        _show_status(keystore, status_now, _unconfirmed_robots(keystore), as_json)
         return
     existing = {}
     for role, file, is_chosen, key in (
@@ -622,12 +621,37 @@ def rotate_ca(
             old_keys_elsewhere=step.kept_elsewhere,
             remarks=() if dry_run else rotation_status(OpenedKeystore(root), now=now()).remarks,
         )
-    cut_off = (
-        f"these robots have not confirmed the stage before: {', '.join(step.cut_off)}. They "
-        f"{'would be' if dry_run else 'are'} cut off from robots that have the files of this "
-        "stage, until they have these files, too"
-    )
-    is_published = bool(publish_command(root))
+    done, to_do = "", list[str]()
+    if not (as_json or dry_run):
+        reached = rotation_status(OpenedKeystore(root), now=now())
+        done, to_do = _step_lines(step, reached, together=finish, same_key=same_key)
+    if step.cut_off:  # after the delivery, before restarts
+        to_do.insert(1, _cut_off_text(step, dry_run=dry_run))
+    print_changed(step, shown, [done] if done else (), first=to_do, restart=False)
+
+
+def _cut_off_text(step: RotationStep, *, dry_run: bool) -> str:
+    """Return which robots have not confirmed the stage before, and what that means for them."""
+    from sros_tool.keystore.fleet import publish_command
+    from sros_tool.keystore.fleet_status import robots_with_shared_keys, shared_keys_clause
+    from sros_tool.keystore.reader import OpenedKeystore
+
+    copied = robots_with_shared_keys(OpenedKeystore(step.root), step.cut_off)
+    are = "would be" if dry_run else "are"
+    cut_off = ""
+    if behind := [robot for robot in step.cut_off if robot not in copied]:
+        cut_off = (
+            f"these robots have not confirmed the stage before: {', '.join(behind)}. They {are} "
+            "cut off from robots that have the files of this stage, until they have these files, "
+            "too"
+        )
+    if copied:
+        clause = shared_keys_clause(copied)
+        cut_off += (
+            f"{f'. {capitalized(clause)}' if cut_off else clause}: if they lack the files of the "
+            f"stage before, they {are} cut off from robots that have the files of this stage"
+        )
+    is_published = bool(publish_command(step.root))
     if is_published and step.stage == "retire" and step.replaces_identity:
         cut_off += (
             ". A web server that has only the new identity CA refuses robots with certificates of "
@@ -638,16 +662,10 @@ def rotate_ca(
         cut_off += (
             ". A robot that fetches and does not trust the new permissions CA yet refuses all "
             "later releases: run "
-            f"`sros distribute_key {quote(str(root))} --robot NAME FOLDER --force`, and bring "
+            f"`sros distribute_key {quote(str(step.root))} --robot NAME FOLDER --force`, and bring "
             "FOLDER to the robot"
         )
-    done, to_do = "", list[str]()
-    if not (as_json or dry_run):
-        reached = rotation_status(OpenedKeystore(root), now=now())
-        done, to_do = _step_lines(step, reached, together=finish, same_key=same_key)
-    if step.cut_off:
-        to_do.insert(1, cut_off)  # after the delivery, before restarts
-    print_changed(step, shown, [done] if done else (), first=to_do, restart=False)
+    return cut_off
 
 
 def _step_lines(
@@ -699,7 +717,13 @@ def _unconfirmed_robots(keystore: OpenedKeystore) -> tuple[str, ...] | str:
 _MOST_ROBOTS = 20
 
 
-def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_json: bool) -> None:
+def _show_status(
+    keystore: OpenedKeystore,
+    status: RotationStatus,
+    unconfirmed: Sequence[str] | str,
+    as_json: bool,
+) -> None:
+    from sros_tool.keystore.fleet_status import robots_with_shared_keys, shared_keys_clause
     from sros_tool.validity import iso
 
     rotation = status.rotation
@@ -722,6 +746,8 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
         echo(f"it is not known which robots confirmed this stage: {unconfirmed}")
     elif unconfirmed:
         echo(f"not confirmed by {first_few(unconfirmed, _MOST_ROBOTS)}: see `sros fleet status`")
+        if clause := shared_keys_clause(robots_with_shared_keys(keystore, unconfirmed)):
+            echo(clause)
     for remark in status.remarks:
         echo(remark)
 

@@ -82,6 +82,7 @@ from sros_tool.pki.certificates import digest
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.validity import Window, iso, parse_iso
 from sros_tool.values import NamedKeystore, Words, shows
+from sros_tool.wording import first_few
 
 
 class State(StrEnum):
@@ -733,6 +734,26 @@ class FleetStatus:
         if clock:  # the ages of the confirmations are not known
             to_do = tuple(robot.without_list() for robot in to_do)
         return replace(self, robots=to_do, overdue=overdue, clock=clock, publication=publication)
+
+
+def shared_keys_clause(robots: Sequence[str]) -> str:
+    """Return a clause on robots (`RobotStatus.has_shared_keys`); "" without robots."""
+    if not robots:
+        return ""
+    return (
+        f"two computers seem to have the keys of {first_few(robots, 3)}, so their "
+        "confirmations do not count"
+    )
+
+
+def robots_with_shared_keys(keystore: OpenedKeystore, names: Sequence[str]) -> list[str]:
+    """Return the robots in ``names`` whose keys two computers seem to have.
+
+    Raises:
+        KeystoreError: the keystore has no fleet, or some of its enclaves may be missing.
+    """
+    robots = fleet_status(keystore, names).robots if names else ()
+    return [robot.robot for robot in robots if robot.has_shared_keys]
 
 
 def fleet_status(

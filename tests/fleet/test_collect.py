@@ -64,6 +64,7 @@ from sros_tool.pki.certificates import Issuer, key_digest, make_request, validit
 from sros_tool.pki.crl import SUPERSEDED, RevocationEntry, load_crl, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
 from sros_tool.validity import BACKDATE, iso, parse_iso
+from sros_tool.wording import capitalized
 from tests.dds.signer_rows import signed_by
 from tests.support.harness import copy_of, create_request, policy_text, publish, sros
 from tests.support.messages import key_of, said_by, signed_message
@@ -485,6 +486,14 @@ def test_new_keys_end_the_alarm_of_two_computers(
         sros("rotate_ca", "ks", "--next", cwd=home.folder).ok()
         refused = sros("rotate_ca", "ks", "--next", cwd=home.folder).err
         assert "Two computers seem to have the keys of r1, so their confirmations" in refused
+        reason = "two computers seem to have the keys of r1, so their confirmations do not count"
+        told = sros("rotate_ca", "ks", "--status", cwd=home.folder).out
+        assert f"not confirmed by r1, r2, r3: see `sros fleet status`\n{reason}\n" in told
+        assert f"r3 yet; {reason}\n" in sros("fleet", "status", "ks", cwd=home.folder).out
+        go_on = ("rotate_ca", "ks", "--next", "--allow-unconfirmed", "--dry-run")
+        said = sros(*go_on, cwd=home.folder).ok().err
+        assert "have not confirmed the stage before: r2, r3. They" in said
+        assert f". {capitalized(reason)}: if they lack the files of the stage" in said
 
 
 @pytest.mark.parametrize("before", ["", "rotated", "restored", "shown"])

@@ -30,7 +30,11 @@ from sros_tool.keystore.fleet import (
     load_fleet,
     publish_command,
 )
-from sros_tool.keystore.fleet_status import fleet_status
+from sros_tool.keystore.fleet_status import (
+    fleet_status,
+    robots_with_shared_keys,
+    shared_keys_clause,
+)
 from sros_tool.keystore.issuing.authority import (
     Authority,
     ImportedAuthority,
@@ -100,7 +104,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm, is_weak
 from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import Span, Window, iso, span_text, window
-from sros_tool.wording import first_few
+from sros_tool.wording import capitalized, first_few
 
 _MOST_SHOWN = 10
 """Maximum number of robots that an error names."""
@@ -307,10 +311,8 @@ def _cut_off_error(
             f"robot{by_hand}, and restart everything. Otherwise go stage by stage, with "
             f"`sros rotate_ca {where} --next`.",
         )
-    status = fleet_status(keystore, robots).robots
-    copied = [robot.robot for robot in status if robot.has_shared_keys]
-    doubt = f" Two computers seem to have the keys of {first_few(copied, _MOST_SHOWN)}, so their "
-    doubt += "confirmations do not count: `sros fleet status` says until when."
+    copied = capitalized(shared_keys_clause(robots_with_shared_keys(keystore, robots)))
+    doubt = f" {copied}: `sros fleet status` says what to do."
     return KeystoreError(
         f"not every robot has confirmed the stage {rotation.stage}: {names}",
         "After the next stage, these robots could not communicate with the other robots."
