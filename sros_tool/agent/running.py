@@ -47,6 +47,11 @@ from sros_tool.runtime.variables import ENABLE, KEYSTORE
 _LONGEST_PATH = 200
 _LONGEST_CLAUSE = 200
 _RESTART_SECONDS = 120.0
+_NOT_ALLOWED = "nteractive authentication required"
+"""What systemctl says to a user who may not restart a unit."""
+_ALLOW_RESTARTS = (
+    "Let the user of the agent restart the unit, with a polkit rule (docs/fetching.md: Restarts)."
+)
 _COMMAND_SECONDS = 30.0
 """How long a command, such as systemctl, may take."""
 
@@ -337,8 +342,11 @@ class Systemd:
             raise UnavailableError(failure, f"{error.strerror or error}.") from error
         if done.returncode:
             error_text = _clause(" ".join((done.stderr or done.stdout).split()))
+            is_forbidden = _NOT_ALLOWED in error_text
             raise UnavailableError(
-                failure, f"{error_text or f'Its exit status is {done.returncode}'}."
+                failure,
+                f"{error_text or f'Its exit status is {done.returncode}'}.",
+                _ALLOW_RESTARTS if is_forbidden else "",
             )
         return done.stdout
 

@@ -1117,6 +1117,9 @@ def test_what_systemctl_says_is_printed_as_it_is(tmp_path: Path) -> None:
     command.chmod(0o755)
     with pytest.raises(UnavailableError, match=r"failed\. See 'status a' \[1\]\. \?\[2J\.\Z"):
         Systemd((str(command),)).restart("a.service")
+    command.write_text("#!/bin/sh\necho 'a: Interactive authentication required.' >&2; exit 1\n")
+    with pytest.raises(UnavailableError, match=r"required\. Let .* a polkit rule \(docs/fetching"):
+        Systemd((str(command),)).restart("a.service")
 
 
 def test_what_is_wrong_with_processes_is_confirmed(r1: Robot) -> None:
