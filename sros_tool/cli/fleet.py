@@ -950,7 +950,9 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         text += f" (not on {first_few(missing, 3)})" if in_force and missing else ""
         if waiting := sum(robot.has_list for robot in lacking):
             have = "have" if waiting > 1 else "has"
-            who = f"{waiting} of these {len(lacking)} robots" if len(lacking) > 1 else missing[0]
+            which = "the other" if in_force else "these"
+            who = f"{which} {len(lacking)} robots" if len(lacking) > 1 else missing[0]
+            who = f"{waiting} of {who}" if waiting < len(lacking) else who
             text += f"; {who} {have} the list, but perhaps not all processes there have loaded it "
             text += "and the current CAs"
         if shared := [robot.robot for robot in lacking if robot.has_shared_keys]:

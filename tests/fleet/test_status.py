@@ -958,6 +958,8 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert field.states()["r1"] == "restart"
     field.confirm("r1", restart=[])
     assert in_force() == [True, False, False]
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert "1 of 3 robots (not on r2, r3); 1 of the other 2 robots has the list, but" in said
     found = field.status()["robots"]["r2"]
     assert (found["state"], found["restart"]) == ("restart", ["/r2/base"])
     assert found["running"] == {"/r2/base": "earlier"}
