@@ -28,7 +28,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.explain.answer import Evaluator, Part, Question
-from sros_tool.explain.explanation import likely_meaning, named_rights
+from sros_tool.explain.explanation import likely_meaning, named_rights, unused_name_clause
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
 from sros_tool.graph.learn import (
@@ -59,9 +59,9 @@ from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
 from sros_tool.keystore.zenoh_files import router_enclaves
 from sros_tool.names import dds_names, expand, is_expression, nodes_served
 from sros_tool.policy.document import join_policies
-from sros_tool.policy.model import ALLOW, Policy
+from sros_tool.policy.model import ALLOW, PEER_RIGHT, Policy
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.rights import Right, order
+from sros_tool.policy.rights import Right, order, policy_rights
 from sros_tool.translate import governance_for
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
 from sros_tool.wording import counted, enumerated, first_few
@@ -140,6 +140,7 @@ class AuditedEnclaves:
     ``what`` is "policy" or "keystore".
     With ``zenoh``, a right has to be in the Zenoh files of ``keystore``, and in the permissions if
     these load.  ``changed_since`` says that the policy changed after the nodes were observed.
+    ``rights`` are the rights of all enclaves.
     """
 
     what: str
@@ -150,6 +151,7 @@ class AuditedEnclaves:
     keystore: OpenedKeystore | None = None
     zenoh: ZenohEvaluator | None = None
     changed_since: bool = False
+    rights: frozenset[Right] = frozenset()
     _evaluators: dict[str, Evaluator] = field(default_factory=dict)
 
     def on_zenoh(self) -> AuditedEnclaves:
@@ -164,6 +166,15 @@ class AuditedEnclaves:
         at, domain = self.context.at, self.context.domain
         zenoh = ZenohEvaluator(self.keystore, moment=at, domain=domain)
         return replace(self, vendor=Vendor.STANDARD, zenoh=zenoh, _evaluators={})
+
+    def has_other_side(self, right: Right) -> bool:
+        """Return whether an enclave has, by exact name, the right that peers of ``right`` need."""
+        return (PEER_RIGHT.get(right.right, ""), right.name) in self._allowed_names
+
+    @cached_property
+    def _allowed_names(self) -> frozenset[tuple[str, str]]:
+        allowed = (right for right in self.rights if right.qualifier is ALLOW)
+        return frozenset((right.right, right.name) for right in allowed)
 
     def evaluator(self, enclave: str) -> Evaluator:
         """Return the evaluator for an enclave; an enclave is loaded only once."""
@@ -232,7 +243,8 @@ def policy_enclaves(
             raise PolicyError(f"unable to find enclave {name} in the policy '{policy.file}'")
         return plan_enclave(enclave, governance, moment=context.at)
 
-    return AuditedEnclaves("policy", EnclaveNodes(nodes), load, vendor, context)
+    rights = frozenset(policy_rights(policy))
+    return AuditedEnclaves("policy", EnclaveNodes(nodes), load, vendor, context, rights=rights)
 
 
 def keystore_enclaves(
@@ -252,7 +264,8 @@ def keystore_enclaves(
     def load(name: str) -> LoadedEnclave:
         return load_enclave(name, enclave_path(source.path, name), moment=context.at)
 
-    return AuditedEnclaves("keystore", EnclaveNodes(nodes), load, vendor, context)
+    rights = source.rights
+    return AuditedEnclaves("keystore", EnclaveNodes(nodes), load, vendor, context, rights=rights)
 
 
 # ── the audit ──────────────────────────────────────────────────────────────────────────────
@@ -721,6 +734,9 @@ def _denied_rights(
             reason = decisions[(by_rule or endpoints)[0]].clause
             is_renamed = enclaves.changed_since
             meant = likely_meaning(right, used, named, is_renamed=is_renamed)
+            is_its_own = enclave in enclaves.nodes.enclaves_for(node.fqn) and not is_renamed
+            if not meant and is_its_own and not enclaves.has_other_side(right):
+                meant = unused_name_clause(right, used, named)
             if meant and not by_rule:
                 reason = f"{reason}; {meant}"
             yield DeniedRight(right, (node.fqn,), reason, bool(by_rule), False, endpoints)

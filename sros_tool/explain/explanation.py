@@ -48,7 +48,7 @@ from sros_tool.keystore.layout import (
     remedy_in_closed_robot,
 )
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
-from sros_tool.names import NODE_SERVICES, is_expression, nodes_served
+from sros_tool.names import GLOBAL_TOPICS, NODE_SERVICES, is_expression, nodes_served
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import Right, action_right, order, profile_rights
 from sros_tool.spelling import is_spelled_alike
@@ -427,6 +427,41 @@ def likely_meaning(
     if len(similar) == 1 and right.kind != "actions" and not is_renamed:
         meaning += f" ({remapping_clause(right.name, similar[0])})"
     return meaning
+
+
+def likely_unused_name(name: str, unused: Iterable[str]) -> str:
+    """Return the allowed name that is probably meant in place of a denied name, or "".
+
+    ``unused`` are the names that the enclave may use in the same way, and does not use.  The result
+    is the only one of them whose last part shares a word with the last part of the denied name; if
+    there is no such name, the only one.
+    """
+
+    def last_part(name: str) -> str:
+        return name.rpartition("/")[2]
+
+    def is_of_every_node(name: str) -> bool:
+        return name in GLOBAL_TOPICS or last_part(name) in NODE_SERVICES
+
+    if is_of_every_node(name):
+        return ""
+    own = [other for other in unused if not is_of_every_node(other)]
+    words = {*last_part(name).split("_")}
+    likely = [other for other in own if words.intersection(last_part(other).split("_"))] or own
+    return likely[0] if len(likely) == 1 else ""
+
+
+def unused_name_clause(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
+    """Return a clause on the only name that fits a denied right, and that is not used; or "".
+
+    ``used`` and ``named`` are as in `likely_meaning`.
+    """
+    if right.kind not in ("topics", "services"):
+        return ""
+    names = [other.name for other in named if other.right == right.right and other not in used]
+    name = likely_unused_name(right.name, names)
+    may = f"the enclave may {right.right} {name}, which the process does not use"
+    return f"{may}: perhaps a remapping or a parameter is missing or wrong" if name else ""
 
 
 _PARTS_OF_NODES = {

@@ -23,6 +23,7 @@ from sros_tool.explain.explanation import (
     explain,
     lacking_part,
     likely_names,
+    likely_unused_name,
     meaning_of_other_kind,
     named_rights,
     remedy,
@@ -43,8 +44,6 @@ from sros_tool.keystore.loading import starts_without_security
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import (
-    GLOBAL_TOPICS,
-    NODE_SERVICES,
     PARAMETER_SERVICES,
     action_part,
     expand,
@@ -672,26 +671,15 @@ class Examiner:
         """Return the allowed name that is probably meant in place of a denied name, or "".
 
         ``own`` are the names of the enclave for the denied right. Names that the log of the process
-        shows do not count. The result is the only name whose last part shares a word with the last
-        part of the denied name; if there is no such name, the only name.
+        shows do not count.
         """
         name = question.name
-        is_of_every_node = name in GLOBAL_TOPICS or _last_part(name) in NODE_SERVICES
-        if is_of_every_node or question.type == "action":
+        if question.type == "action":
             return ""
         if self._policy and self._policy.possible_namespace(name, denial.enclave):
             return ""
-        unused = [
-            other
-            for other in own
-            if other not in GLOBAL_TOPICS
-            and _last_part(other) not in NODE_SERVICES
-            and other not in self._logged_names[denial.process]
-        ]
-        words = {*_last_part(name).split("_")}
-        alike = [other for other in unused if words.intersection(_last_part(other).split("_"))]
-        likely = alike or unused
-        return likely[0] if len(likely) == 1 else ""
+        logged = self._logged_names[denial.process]
+        return likely_unused_name(name, [other for other in own if other not in logged])
 
     @cached_property
     def _logged_names(self) -> Mapping[str, Set[str]]:

@@ -94,6 +94,10 @@ def lacks(used: str, allowed: str) -> str:
 
 
 TALKER = {"/t": {"/talker": ["publish chatter"]}}
+UNUSED = (
+    "; the enclave may {}, which the process does not use: perhaps a remapping or a parameter is "
+    "missing or wrong"
+)
 UNNAMED = "the policy has no enclave for this node"
 
 
@@ -135,6 +139,18 @@ def talks(*more: str, enclave: str = "/", fqn: str = "/talker", pid: str = "p1")
                 "rt/talker/transition_event; if /talker is a lifecycle node, include "
                 "common/lifecycle_node.xml in its profile, in place of common/node.xml"
             ],
+        ),
+        # A parameter names another topic. Twin: peers have a right to this topic.
+        *(
+            (
+                {"/t": {"/driver": ["publish motor_cmd", "publish /tf"], "/base": [peers]}},
+                [node("/driver", "publish /base/cmd", enclave="/t")],
+                [f"/t publish topic /base/cmd (/driver): no rule allows publish rt/base/cmd{hint}"],
+            )
+            for peers, hint in (
+                ("subscribe /x", UNUSED.format("publish /motor_cmd")),
+                ("subscribe /base/cmd", ""),
+            )
         ),
         # What another node of the process uses is no name that a remapping lacks.
         (
@@ -194,7 +210,7 @@ def test_the_rest_of_a_process_shows_its_enclave(tmp_path: Path) -> None:
     )
     found = audited(tmp_path, enclaves, seen)
     text = "/b publish topic /x (/b): no rule allows publish rt/x"
-    assert said(found) == [text]
+    assert said(found) == [text + UNUSED.format("publish /y")]
     assert found.notes == ()
 
 
