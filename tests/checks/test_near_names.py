@@ -162,10 +162,13 @@ def test_a_name_with_a_counterpart_is_no_typing_error(tmp_path: Path) -> None:
 def test_the_shipped_policies_have_none() -> None:
     for file in policies_dir().rglob("*.xml"):
         ids = {each.id for each in policy_file_findings(file)}
-        assert not ids & {"policy.name-misspelt", "policy.side-mistaken"}, file
+        assert not ids & {"policy.name-misspelt", "policy.side-mistaken", SEVERAL}, file
 
 
-def sides(path: Path, server: str, client: str) -> list[str]:
+SEVERAL = "policy.several-servers"
+
+
+def sides(path: Path, server: str, client: str, kind: str = "policy.side-mistaken") -> list[str]:
     """Return the texts of findings about sides; both nodes are in enclaves of their own."""
     profiles = (
         f'<enclave path="/{name}"><profiles>\n<profile ns="/" node="_{name}">{content}</profile>'
@@ -173,7 +176,7 @@ def sides(path: Path, server: str, client: str) -> list[str]:
         for name, content in (("server", server), ("client", client))
     )
     path.write_text(f'<policy version="0.2.0"><enclaves>{"".join(profiles)}</enclaves></policy>')
-    said = [each for each in policy_file_findings(path) if each.id == "policy.side-mistaken"]
+    said = [each for each in policy_file_findings(path) if each.id == kind]
     return [f"{each.line}: {each.text} {each.remedy}" for each in said]
 
 
@@ -185,10 +188,43 @@ def test_sides_that_are_mistaken_for_each_other(tmp_path: Path) -> None:
     (own,) = sides(file, services("request", "~/home"), use)
     assert own.startswith("2: the node may request service /_server/home, a name of its own that")
     assert own.endswith('Write reply="ALLOW" for it.')
-    (foreign,) = sides(file, right, services("reply", "_server/home"))
+    (foreign,) = sides(file, right, foreign_server := services("reply", "_server/home"))
     assert foreign.startswith("3: the node may reply service /_server/home, under the name of a")
     assert foreign.endswith('Write request="ALLOW" for it.')
+    assert sides(file, right, foreign_server, SEVERAL) == []
     assert "p.xml:2" in foreign and "nobody may request it" in foreign
     both = services("reply", "_server/home") + use
     assert sides(file, right, both) == [], "a second server"
     assert sides(file, topics("subscribe", "~/goal"), "") == [], "of topics, this is usual"
+
+
+EXECUTE = '<actions execute="ALLOW"><action>{}</action></actions>'
+PART = services("reply", "_server/go/_action/send_goal")
+
+
+@pytest.mark.parametrize(
+    ("server", "other", "found"),
+    [
+        (services("reply", "~/home"), services("reply", "_server/home"), True),
+        (services("reply", "~/*"), services("reply", "_server/home"), True),
+        (services("reply", "/clear"), services("reply", "/clear"), True),
+        (EXECUTE.format("~/go"), EXECUTE.format("_server/go"), True),
+        (EXECUTE.format("~/go"), PART, True),
+        (services("reply", "~/home"), services("reply", "*"), False),
+        (services("reply", "*"), services("reply", "/clear"), False),
+        (services("reply", "~/home"), services("reply", "~/home"), False),
+        (services("reply", "~/stop"), services("reply", "_server/home"), False),
+        (
+            services("reply", "~/home"),
+            services("reply", "_server/home") + services("reply", "_server/*", qualifier="DENY"),
+            False,
+        ),
+        # "policy.other-nodes-parameters" is about these.
+        (services("reply", "~/*"), services("reply", "_server/set_parameters"), False),
+    ],
+)
+def test_two_servers_of_a_service(tmp_path: Path, server: str, other: str, found: bool) -> None:
+    """Twins: each serves its own names, or the names of a wildcard; also if somebody calls."""
+    used = services("request", "/_server/home", "/clear")
+    used += EXECUTE.format("/_server/go").replace("execute", "call")
+    assert len(sides(tmp_path / "p.xml", server + used, other, SEVERAL)) == found

@@ -33,6 +33,7 @@ FOUND_OTHERWISE = {
     "policy.enclave-in-two-files",
     "policy.node-in-two-enclaves",
     "policy.node-misspelt",
+    "policy.several-servers",
     "policy.include-fallback",
     "policy.redundant-include",
     "portable.enclave-names",

@@ -12,6 +12,7 @@ from sros_tool.names import (
     ACTION_SEPARATOR,
     GLOBAL_TOPICS,
     NODE_SERVICES,
+    PARAMETER_SERVICES,
     READING_SERVICES,
     action_part,
     expand,
@@ -69,6 +70,17 @@ MISTAKEN_SIDE = FindingKind(
     'Write reply="ALLOW" (action: execute) at the node that offers the service, and '
     'request="ALLOW" (action: call) at the nodes that use it.',
 )
+SEVERAL_SERVERS = FindingKind(
+    "policy.several-servers",
+    WARNING,
+    "a service or action that two enclaves may serve",
+    "Both receive the requests, and a client may take the answer of either. So a process in one "
+    "enclave can pose as the server in the other one. (For services that set or read parameters, "
+    "this is policy.other-nodes-parameters.)",
+    "sros: compares the rights of all enclaves in the policies that are checked together.",
+    "Remove the right from the enclave whose nodes do not serve it. If nodes of both enclaves "
+    "serve it, leave this finding out: `--exclude policy.several-servers`.",
+)
 _ASKING_RIGHT = {offering: asking for asking, offering in OFFERING_RIGHT.items()}
 
 
@@ -96,6 +108,59 @@ def check_counterparts(checked_policy: CheckedPolicy) -> Iterator[Finding]:
         if not sides.names(offering).overlaps(name) and ACTION_SEPARATOR not in name:
             text = f"no enclave may {offering} a name that {name} matches"
             yield statement.found(NO_COUNTERPART, text)
+
+
+def check_servers(checked_policy: CheckedPolicy) -> Iterator[Finding]:
+    """Yield findings about services and actions that two enclaves may serve.
+
+    The server is the enclave with the node whose name is in the name of the service, also if the
+    right has a wildcard; otherwise, it is the first enclave with a right to exactly this name. The
+    findings are about the other enclaves.
+    """
+    rules, sides = checked_policy.rules, _Sides(checked_policy.statements)
+    enclaves_by_node: dict[str, dict[str, None]] = defaultdict(dict)
+    for stated in checked_policy.policy.enclaves:
+        for profile in stated.all_profiles():
+            if profile.node:
+                enclaves_by_node[profile.full_name][stated.path] = None
+    offers = [statement for statement in checked_policy.statements if statement.allows]
+    exact = {(statement.right.enclave, *_whole_offer(statement)) for statement in offers}
+    first: dict[tuple[str, str], str] = {}
+    for statement in offers:
+        enclave, (right, name) = statement.right.enclave, _whole_offer(statement)
+        if right not in ("reply", "execute") or is_expression(name):
+            continue
+        node = next((of for of in _nodes_above(name) if of in enclaves_by_node), "")
+        owners = enclaves_by_node.get(node, {})
+        if enclave in owners or name.rpartition("/")[2] in PARAMETER_SERVICES:
+            continue
+        if not rules.allow(enclave, statement.right.right, statement.name):
+            continue
+        if sides.lack(_ASKING_RIGHT[right], statement) and any(
+            (of, right, name) in exact for of in owners
+        ):
+            continue  # perhaps the statement has the wrong side: `check_counterparts` says so
+        other = next((of for of in owners if rules.allow(of, right, name)), "")
+        where = f", under the name of a node in {other}; that enclave" if other else ""
+        other = other or first.setdefault((right, name), enclave)
+        if other != enclave:
+            where = where or f"; {other}"
+            text = f"the node may {statement.right.describe()}{where} may also serve it"
+            yield statement.found(SEVERAL_SERVERS, text)
+
+
+def _whole_offer(statement: PolicyStatement) -> tuple[str, str]:
+    """Return right and name of a statement; a part of an action counts as the action."""
+    action, part = action_part(statement.name)
+    if part and statement.right.right == "reply":
+        return "execute", action
+    return statement.right.right, statement.name
+
+
+def _nodes_above(name: str) -> Iterator[str]:
+    """Yield the names that a node could have whose private name is ``name``."""
+    while name := name.rpartition("/")[0]:
+        yield name
 
 
 class _Sides:

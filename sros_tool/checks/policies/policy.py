@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind, group_by_cause
-from sros_tool.checks.policies.counterparts import check_counterparts
+from sros_tool.checks.policies.counterparts import check_counterparts, check_servers
 from sros_tool.checks.policies.enclaves import (
     check_instances,
     check_node_names,
@@ -81,6 +81,7 @@ def findings_in(
     for checked_policy in checked:
         if not of_fleet:
             yield from node_in_two_enclaves_findings(checked_policy.policy.enclaves)
+            yield from check_servers(checked_policy)
         for check in _CHECKS_TOGETHER:
             yield from check(checked_policy)
 
