@@ -73,7 +73,7 @@ from sros_tool.wording import counted, first_few
 
 _LOG = logging.getLogger(__name__)
 _SHOWN = 5
-_NAMED, _LONGEST = 3, 100
+_NAMED, _LONGEST = 3, 200
 """Maximum number of names in a refusal, and of characters about the rights of an enclave."""
 _ENDS_OF_LIST_PATHS = tuple(f"/{file}" for file in LIST_FILES)
 _WAITING = frozenset({LATER_RELEASE, PUBLISHING})
