@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.issuing.size import MinimizedEnclave
     from sros_tool.keystore.rights import RightsSource, SourcesDifference
     from sros_tool.policy.merge import Merged
-    from sros_tool.policy.model import Source, StatedProtection
+    from sros_tool.policy.model import Policy, Source, StatedProtection
     from sros_tool.policy.rights import RightsDifference
     from sros_tool.proof.growth import DroppedDenial, Gain, Growth, NewNode, NewReach
     from sros_tool.proof.sources import AccessSource
@@ -353,8 +353,29 @@ def diff_policy(
             command = f"sros diff_policy --no-new-access {quote(str(a))} {quote(str(b))}"
             shows = f"`{command}` shows what B opens, `sros inspect` shows each governance"
             echo(f"the governance differs: {shows}", err=True)
+        if count and _have_same_nodes_elsewhere(first.policy, second.policy):
+            command = f"sros minimize_policy {quote(str(a))} --observed {quote(str(b))}"
+            echo(
+                "the same nodes have enclaves with other names: if B was learned from a robot, "
+                f"`{command}` compares the rights of each node",
+                err=True,
+            )
     print_notes((*first.notes, *second.notes))
     return 0 if not compared and first.sound and second.sound else 1
+
+
+def _have_same_nodes_elsewhere(first: Policy | None, second: Policy | None) -> bool:
+    """Return whether two policies have the same nodes, but some in no enclave of the same name."""
+    if not first or not second:
+        return False
+    places, others = (
+        {(node, enclave) for enclave, nodes in policy.nodes().items() for node in nodes}
+        for policy in (first, second)
+    )
+    nodes, other_nodes, unmoved = (
+        {node for node, _ in each} for each in (places, others, places & others)
+    )
+    return nodes == other_nodes != unmoved
 
 
 _MOST_LINES, _MOST_PICTURE, _MOST_LINKS = 12_000, 25_000, 250

@@ -441,6 +441,11 @@ def test_diff_tells_in_ros_terms(folder: Path) -> None:
 
 
 def test_diff_of_the_same(folder: Path) -> None:
+    hint = "`sros minimize_policy a.xml --observed moved.xml` compares the rights of each node"
+    for enclave, node, hinted in (("/n", "n", True), ("/n", "m", False), ("/a", "n", False)):
+        moved = policy_text({enclave: publish("x")}).replace('node="n"', f'node="{node}"')
+        (folder / "moved.xml").write_text(moved)
+        assert (hint in sros("diff_policy", "a.xml", "moved.xml").err) is hinted
     ended = sros("diff_policy", "a.xml", "a.xml")
     assert (ended.status, ended.out) == (0, "")
     assert json.loads(sros("diff_policy", "a.xml", "a.xml", "--json").out)["equal"] is True
