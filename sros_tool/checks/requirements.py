@@ -93,14 +93,13 @@ HOLDS_ALONE = FindingKind(
     "requirement.holds-alone",
     NOTE,
     "a requirement that only further enclaves could break",
-    "The enclaves here cannot break the requirement, or a part of it; or none of them has the "
-    "other side of a name in it, such as the server of a called service. Perhaps this is the "
-    "policy of a package, and only the policies of the package's users have the enclaves that "
-    "could break the requirement.",
+    "The enclaves here cannot break the requirement, or a part of it. Or none of them has the "
+    "other side of a name in it, such as the server of a called service. For the policy of a "
+    "package, this is normal: the enclaves of its users could break the requirement.",
     "The requirements file.",
-    "For the policy of a package, also check the policy of a robot with further enclaves: `sros "
-    "check ROBOT_POLICY --requirements FILE --namespace NS`. For the policy of a whole robot, add "
-    "`--namespace /`: then sros warns if a name was probably changed.",
+    "For the policy of a package, also check a robot with further enclaves: `sros check "
+    "ROBOT_POLICY --requirements FILE --namespace NS`. For the policy of a whole robot, add "
+    "`--namespace /` to be warned of names that were probably changed.",
     prominent=True,
 )
 NOT_CROSSING = FindingKind(

@@ -835,9 +835,8 @@ _UNANSWERED_REMEDY = (
 )
 
 _UNANSWERED_ALONE_REMEDY = (
-    "Ignore this finding if nodes of the package's users have the other side. Otherwise, the name "
-    "was changed: write the new name into the requirement, or check with the --remap of "
-    "`merge_policy`."
+    "Ignore this finding if nodes of the package's users have the other side. If the name was "
+    "changed, write the new name into the requirement, or check with the --remap of `merge_policy`."
 )
 
 _ENCLAVES_REMEDY = (
