@@ -102,6 +102,7 @@ def test_processes_of_two_users_need_one_user_rather_than_a_restart() -> None:
     (same,) = connection_findings([(first, second)])
     assert same.text == "it has not connected to process 2 (node2): they do not hear each other"
     assert "restart the process" in same.remedy
+    assert "the program may turn security off in its own environment" in same.remedy
     (different,) = connection_findings([(first, replace(second, user=1000))])
     assert different.remedy.startswith("Run these processes as one user")
 
