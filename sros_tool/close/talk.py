@@ -33,7 +33,7 @@ from sros_tool.graph.observation import (
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.names import expand, is_expression
-from sros_tool.policy.model import ALLOW
+from sros_tool.policy.model import ALLOW, PEER_RIGHT
 from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import (
     Right,
@@ -257,6 +257,15 @@ class _TalkComparison:
         later = sorted({*map(node_name, nodes)} - known)
         return [*later, *_endpoint_texts((node, use) for node, use in uses if node in known)]
 
+    def _removed_rights(self) -> Iterator[Right]:
+        """Yield the rights that nodes used whose enclaves the policy no longer has."""
+        kept = self._nodes.policy_enclaves
+        for node in robot_nodes(self._nodes.in_their_enclaves):
+            for enclave in {*node.enclaves} - kept:
+                for right, name in {*map(ros_use, node.endpoints)}:
+                    if right in PEER_RIGHT:
+                        yield Right(enclave, ALLOW, right, name)
+
     def _unused_rights(self) -> list[Right]:
         """Return the rights of the policy to one name that no node used, then or now."""
         policy, robot = self._nodes.policy, self._running.robot
@@ -298,9 +307,9 @@ class _TalkComparison:
             rights = ", ".join(f"{each.right.enclave} {each.right.describe()}" for each in denied)
             number = counted(len(denied), "right")
             yield f"the policy takes away {number} that the robot used: {rights}"
-            lost = _without_counterpart(self._running.robot, [right.right for right in denied])
-            if lost:
-                yield f"left without a counterpart: {first_few(lost, MOST_NAMES, '; ')}"
+        gone = [*(right.right for right in self._denied), *self._removed_rights()]
+        if lost := _without_counterpart(self._running.robot, gone):
+            yield f"left without a counterpart: {first_few(lost, MOST_NAMES, '; ')}"
         if not_now := self._lost_endpoints(as_now.nodes):
             names = first_few(_endpoint_texts(not_now), MOST_NAMES)
             yield f"allowed, but not seen now, and not always seen during the watch: {names}"

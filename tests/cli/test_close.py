@@ -427,6 +427,8 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
         in ended.out
     )
     assert "yes: everything that talked can still talk: 1 node with 18 endpoints" in ended.out
+    alone = "left without a counterpart: /talker may publish /chatter, but no enclave may subscribe"
+    assert f"\n  {alone} to it any more\n" in ended.out
 
 
 def refuse_undo_of_others(robot: Robot) -> None:
