@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from sros_tool.cli.changed import (
     print_changed,
     print_follow_up,
     print_plan,
+    shown_names,
 )
 from sros_tool.cli.common import (
     PATH,
@@ -283,7 +284,25 @@ def revoke(
         shown,
         enclave_lines(names, "revoked enclave {}"),
         planned=planned_lines(root, names, "would revoke enclave {}"),
+        after=_lines_on_closed_robot(root, names),
     )
+
+
+def _lines_on_closed_robot(root: Path, revoked: Iterable[str]) -> Iterator[str]:
+    """Yield a line if the policy in the folder of `sros close` still names revoked enclaves."""
+    from sros_tool.keystore.layout import CLOSED_POLICY, folder_of_closed_robot
+    from sros_tool.policy.document import read_policy
+
+    robot, named = folder_of_closed_robot(root), list[str]()
+    with suppress(SrosError):  # `sros close` says what is wrong with the policy
+        policy = read_policy(robot / CLOSED_POLICY) if robot else None
+        named = [name for name in revoked if policy and policy.enclave(name)]
+    if robot and named:
+        yield (
+            f"first remove {shown_names(named)} from '{robot / CLOSED_POLICY}' (and from "
+            f"requirements.toml): otherwise, `sros close {quote(str(robot))}` exports nothing, and "
+            "no process gets the revocation list"
+        )
 
 
 @verb("crl")

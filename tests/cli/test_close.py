@@ -389,8 +389,10 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     policy = robot.folder / "robot/policy.xml"
     before, enclave, after = policy.read_text().partition('    <enclave path="/talker">')
     head, _, _ = before.partition('    <enclave path="/listener">')
-    policy.write_text(head + enclave + after)
     revoke = "sros revoke robot/keystore /listener"
+    remove = "first remove /listener from 'robot/policy.xml' (and from requirements.toml): otherw"
+    assert remove in sros(*revoke.split()[1:], "--dry-run", cwd=robot.folder).err
+    policy.write_text(head + enclave + after)
     mine = robot.folder / "robot/start/mine.env"
     mine.write_text("A=1\n")
     drop_in = robot.folder / "robot/start/units/listener.service.d/sros-close.conf"
@@ -414,7 +416,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     assert (robot.folder / LOST / "key.pem").exists()
     shutil.rmtree(robot.folder / LOST)
     assert robot.restarts == []
-    sros(*revoke.split()[1:], cwd=robot.folder).ok()
+    assert "first remove" not in sros(*revoke.split()[1:], cwd=robot.folder).err
     robot.remaining = (TALKER,)
     left = robot.folder / "robot/export/enclaves/listener"
     assert left.exists() and not (robot.folder / "robot/start/listener.env").exists()
