@@ -151,7 +151,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
         required,
         talk,
         *connected,
-        silence,
+        _with_possible_cause(silence, connected),
     ]
 
 
@@ -473,6 +473,15 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
     number = nodes_text(before.nodes)
     reason = f"the listener saw {number} before (without removed ones), and sees none now"
     return Proof(SILENCE, True, reason)
+
+
+def _with_possible_cause(silence: Proof, connected: Iterable[Proof]) -> Proof:
+    """Return the proof of silence; if it fails, with the processes that may run open."""
+    if silence.fails and any(proof.fails for proof in connected):
+        cause = "a process that has not connected may be what the listener sees: its program may "
+        cause += "turn security off by itself, or have another context without security"
+        return silence._replace(details=[*silence.details, cause])
+    return silence
 
 
 def _seen_by_listener(value: Mapping[str, Any]) -> Iterator[str]:

@@ -14,8 +14,14 @@ import pytest
 from sros_tool.close import proof
 from sros_tool.close.acceptance import Acceptance
 from sros_tool.close.nodes import MovedEndpoint
-from sros_tool.close.proof import _proof_of_connections, _proof_of_requirements, _proof_of_silence
+from sros_tool.close.proof import (
+    _proof_of_connections,
+    _proof_of_requirements,
+    _proof_of_silence,
+    _with_possible_cause,
+)
 from sros_tool.close.robot import Shell
+from sros_tool.close.state import CONNECTED, Proof
 from sros_tool.close.talk import (
     _abandoned_names,
     _endpoint_texts,
@@ -350,6 +356,9 @@ def test_a_listener_finds_what_writes_openly_under_the_name_of_a_tool() -> None:
     value = {"nodes": [], "notes": [note], "settled": True}
     proof = _proof_of_silence(robot_beside_graph(value), Observation(), hears=True)
     assert proof.fails and "`ros2`: /_ros2cli_7 (publish topic /cmd_vel)" in proof.reason
+    for holds in (True, False, None):
+        told = _with_possible_cause(proof, [Proof(CONNECTED, holds, "")])
+        assert ("a process that has not connected may" in "".join(told.details)) is (holds is False)
 
 
 def robot_beside_graph(*values: dict[str, Any], **environment: str) -> Any:
