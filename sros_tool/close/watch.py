@@ -19,7 +19,7 @@ from sros_tool.close.assignment import (
 from sros_tool.close.nodes import ObservedNodes, node_name, nodes_text
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, LocalRobot
-from sros_tool.close.state import RunningRobot
+from sros_tool.close.state import RunningRobot, keystore_text
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.explain.explanation import likely_meaning
 from sros_tool.files import policies_dir, remove_file, replace_file
@@ -99,6 +99,10 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     running = RunningRobot(robot)
     if status:
         others = running.other_domains_text()
+        enclaves = [process.enclave for process in running.in_domain if process.enclave]
+        for files in sorted({*map(keystore_text, enclaves)})[:1]:
+            others += ". " * bool(others) + f"Processes run with the files of '{files}': if that "
+            others += f"is the robot, name its folder, not '{robot.folder}'"
         raise UnavailableError(
             f"there is no robot to close: no node was observed in domain {robot.domain}",
             f"{others}." if others else "",

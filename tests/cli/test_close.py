@@ -51,6 +51,7 @@ from sros_tool.runtime.processes import (
     SEVERAL_USERS,
     FileReader,
     Process,
+    ProcessEnclave,
     ProcessOrigin,
     ProcessRoot,
     ProcessTable,
@@ -1988,6 +1989,10 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     run = "run `sros close robot --domain 7`"
     there = f"process 5 (a) runs in domain 7, not in 0; to close it, {run}"
     assert f"to close: no node was observed in domain 0. {there}. Otherwise start the" in ended.err
+    closed = Process(5, ("a",), {}, datetime.now(UTC), enclave=ProcessEnclave("/r/export", "/a"))
+    robot.more = (closed,)
+    there = "Processes run with the files of '/r/export': if that is the robot, name its folder, n"
+    assert f"in domain 0. {there}" in robot.close(status=2).err
     robot.more = ()
     assert not (robot.folder / "robot").exists()
     (robot.folder / "robot").mkdir()  # by somebody else: it stays
