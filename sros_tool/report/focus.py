@@ -29,6 +29,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_text, unguarded_topics
 from sros_tool.report.compose import PictureSource, edge_order, namespace_of, protection_of
 from sros_tool.report.layout import (
+    INFLUENCE,
     MARGIN,
     Card,
     Head,
@@ -648,7 +649,7 @@ class _Draft:
             for card in cards.values():
                 if card.column == last and not near.isdisjoint(card.members):
                     ends = ("s:", card.id) if before else (card.id, "l:")
-                    yield Link(*ends, 0, 0, ("influence",), ALLOW, WireLevel.UNKNOWN, False, _BOTH)
+                    yield Link(*ends, 0, 0, INFLUENCE, ALLOW, WireLevel.UNKNOWN, False, _BOTH)
 
     def _hops_to_focus(self, is_before_focus: bool, hop: int) -> int:
         """Return the number of hops to show for ``hop``.

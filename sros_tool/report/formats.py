@@ -19,6 +19,7 @@ from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import matches
 from sros_tool.report.folding import Folding
 from sros_tool.report.layout import (
+    INFLUENCE,
     KIND_NAMES,
     LINE,
     ONLOOKERS,
@@ -222,6 +223,8 @@ _DIFFERS = "the robots (namespaces, enclaves) that are drawn as one do not have 
 
 def _link_text(picture: Picture, link: Link) -> str:
     """Return the tooltip of a link."""
+    if link.rights == INFLUENCE:
+        return "influence over names that are not drawn"
     overlay = picture.overlay
     text = f"{link.qualifier.value} {', '.join(link.rights)}"
     if link.wildcard:

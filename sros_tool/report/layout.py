@@ -171,6 +171,10 @@ class Link:
     differs: bool = False
 
 
+INFLUENCE = ("influence",)
+"""The label of an arrow between a drawn enclave and enclaves that are not drawn."""
+
+
 class Onlooker(NamedTuple):
     """An enclave with rights to very many names: their cards show a letter (``tag``), not lines."""
 

@@ -17,7 +17,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network
 from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.focus import FocusFlow, flow_scene, focused_picture
-from sros_tool.report.formats import render_dot, render_mermaid
+from sros_tool.report.formats import _link_text, render_dot, render_mermaid
 from sros_tool.report.picture import Picture, SourceTitle
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, group, hostile_permissions, source_of
 from tests.support.harness import policy_text, sros
@@ -57,6 +57,8 @@ def test_the_answer_is_a_sentence_and_only_what_leads_to_the_name_is_drawn(tmp_p
     scene = flow_scene(picture)
     check_flow(scene_columns := {c.id: c.column for c in scene.cards}, picture)
     assert scene_columns["s/planner"] < scene_columns["s/mux"] < scene_columns["l/base"]
+    (link,) = (link for link in scene.links if link.source == "s:")
+    assert _link_text(picture, link) == "influence over names that are not drawn"
     further = next(card for card in scene.cards if card.id == "s:")
     assert (further.members, further.notes) == (("/web",), ("over up to 3 hops",))
     assert "s/web" in {card.id for card in flow_scene(picture, 3).cards}
