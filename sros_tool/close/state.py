@@ -211,10 +211,10 @@ class RunningRobot:
         if names == [CRL_FILE]:
             return f"{warning}{_ACCEPTS_REVOKED}"
         or_mode = "" if newer.endswith(PLACE_OR_MODE) else ", or got another mode,"
-        after = "after the start of"
+        changed = f"{newer} changed{or_mode} after the start of"
         if CRL_FILE in names:
-            after = "and certificates that were revoked since are accepted by"
-        return f"{warning}{newer} changed{or_mode} {after}"
+            changed = f"revoked certificates are still accepted, because {changed}"
+        return f"{warning}{changed}"
 
     def not_observed(self) -> Sequence[str]:
         """Return the processes in enclaves that sros did not observe, as text.

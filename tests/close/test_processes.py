@@ -306,11 +306,17 @@ def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> N
     old, unread = replace(fresh, started=now - timedelta(1)), LoadedFile("/s.json5", problem="odd")
     unchanged = LoadedFile("cert.pem", now - timedelta(2))
     placed = replace(enclave, files=(unchanged,), moved={"/export": now})
+    listed = replace(enclave, files=(file, LoadedFile("crl.pem", now)))
     robot: Any = SimpleNamespace(export=tmp_path, domain=0)
     for processes, why in (
         (
             (replace(old, enclave=placed),),
             "'/export' (its place or mode) changed after the start of",
+        ),
+        (
+            (replace(old, environment={"ROS_SECURITY_STRATEGY": "Enforce"}, enclave=listed),),
+            "revoked certificates are still accepted, because cert.pem, crl.pem changed, or got "
+            "another mode, after the start of",
         ),
         ((fresh,), None),
         ((fresh, replace(old, user=4321)), None),
