@@ -187,6 +187,12 @@ def test_a_node_that_lacks_everything_lacks_its_parameters_too(tmp_path: Path) -
 def test_wildcards_give_what_a_node_needs(tmp_path: Path) -> None:
     every = topics("publish", "/*") + services("reply", "/*")
     assert "policy.no-rosout" not in ids(tmp_path, policy(enclave(every, basics=False)))
+    wide = policy(enclave(topics("publish", "/cam*", "/*/a*")))
+    said = {each.text for each in findings(tmp_path, wide) if each.id == "policy.wide-wildcard"}
+    assert said == {
+        "publish topic /cam* has a wildcard in the only part of the name",
+        "publish topic /*/a* has a wildcard in the first part and in the last part of the name",
+    }
 
 
 NARROW, WIDE = topics("publish", "/x/a"), topics("publish", "/x/*")

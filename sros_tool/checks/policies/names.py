@@ -144,9 +144,9 @@ def _broad_right_findings(statement: PolicyStatement) -> Iterator[Finding]:
         yield statement.found(kind, f"{text} matches every name")
     elif literal_prefix(name).count("/") < 2 and is_expression(name.rpartition("/")[2]):
         kind = READS_EVERYTHING if right == "subscribe" else WIDE
-        yield statement.found(
-            kind,
-            f"{text} has a wildcard in the first part and in the last part of the name",
+        where = (
+            "in the first part and in the last part" if name.count("/") > 1 else "in the only part"
         )
+        yield statement.found(kind, f"{text} has a wildcard {where} of the name")
     elif right == "request" and any(covers(name, f"/*/{service}") for service in _SETTING_SERVICES):
         yield statement.found(SETS_PARAMETERS, f"{text} matches every node")
