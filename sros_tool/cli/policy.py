@@ -624,7 +624,7 @@ def minimize_policy(
         never observed, but kept because every node needs them: 11 rights
         observed, and not allowed
           publish topic /cmd_vel
-        permissions.p7s: 4044 bytes, then 4028, of at most 61439
+        permissions.p7s: 4044 bytes, narrowed 4028 (Fast DDS 2.6 ...
       wrote 'narrow.xml'
       $ sros minimize_policy robot.xml --observed learned.xml --fleet fleet.toml
     """
@@ -690,9 +690,10 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
     if use.not_allowed:
         yield "  observed, and not allowed"
         yield from (f"    {right.describe()}" for right in use.not_allowed)
-    then = f", then {sizes.after}" if sizes.after != sizes.before else ""
-    too_large = "" if sizes.after < sizes.limit else ": TOO LARGE for Fast DDS 2.6 and 2.9"
-    yield f"  permissions.p7s: {sizes.before} bytes{then}, of at most {sizes.limit - 1}{too_large}"
+    then = f", narrowed {sizes.after}" if sizes.after != sizes.before else ""
+    too_large = "" if sizes.after < sizes.limit else ": TOO LARGE"
+    limit = f"Fast DDS 2.6 and 2.9 take {sizes.limit - 1}"
+    yield f"  permissions.p7s: {sizes.before} bytes{then} ({limit}){too_large}"
     for proposal in enclave.proposals:
         names = [right.describe() for right in proposal.adds]
         adds = (

@@ -79,7 +79,7 @@ _OTHERS_SEEN = {
     "graph.ended": "nodes that ended while it listened:",
     "graph.silent": "nodes without endpoints:",
     "graph.stray": "topics with writers or readers that belong to no ROS node:",
-    "graph.tool-writes": "nodes that write, with names of the command `ros2`:",
+    "graph.tool-writes": "nodes that write, although they have names of the command `ros2`:",
 }
 """The notes of `generate_policy` on what it sees besides the nodes of its result, as words."""
 
