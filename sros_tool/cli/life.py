@@ -378,8 +378,7 @@ def crl(
         for line in _list_lines(lists, _enclaves_by_serial(keystore, lists)):
             echo(line)
     else:
-        unknown = "the keystore knows of no revocation"
-        echo(unknown if age_notes else "nothing was ever revoked", err=True)
+        echo("the keystore knows of no revocation", err=True)
     print_notes(age_notes)
     if result and dry_run:
         return 0
