@@ -1117,7 +1117,7 @@ def _groups(
     current: list[RobotStatus] = []
     clauses_by_robot: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
-        if apart or robot.state != "current" or robot.notes or robot.problems:
+        if apart or robot.state != "current" or robot.notes or robot.problems or robot.is_lost:
             files = (
                 *_expiry_clauses(robot, compared_fleet.at),
                 *_summary(robot, status.stage, compared_fleet.at),
@@ -1151,7 +1151,7 @@ def _rows(
     problems = (lambda _: ()) if robots else _gravest_problem
     groups = _groups(compared_fleet, problems, apart=apart)
     if not apart and all(group.state == "current" for group in groups):
-        groups = [group for group in groups if group.what]
+        groups = [group for group in groups if group.what or group.to_do]
     if not groups:
         return
     yield "robot", "state", "confirmed", "to do", "what"

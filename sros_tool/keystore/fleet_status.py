@@ -365,18 +365,21 @@ class RobotStatus:
         """Whether there is nothing to do: the files are current and the agent reports no problem.
 
         A robot without enclaves is settled, too.  A revoked robot is settled once its enclaves are
-        gone, because only the other robots need the revocation list, unless it has a certificate
-        from after the backup of the keystore that is not revoked (``is_lost``).
+        gone, because only the other robots need the revocation list.  No robot is settled if a
+        restored keystore lacks an enclave of the robot whose certificate is not revoked
+        (``is_lost``).
         """
+        if self.is_lost:
+            return False
         if self.state is State.REVOKED:
-            return not (self.enclaves or self.is_lost)
+            return not self.enclaves
         return self.state is State.NONE or (self.state is State.CURRENT and not self.problems)
 
     @property
     def mended(self) -> bool:
         """Whether the robot is `is_settled` except for problems that its agent has mended."""
         is_over = self.state is State.CURRENT and all(map(is_mended, self.problems or ()))
-        return self.is_settled or is_over
+        return self.is_settled or (is_over and not self.is_lost)
 
     @property
     def may_have_copied_key(self) -> bool:
@@ -461,14 +464,14 @@ class RobotStatus:
         ``limit`` is the age from which a confirmation is overdue.  ``is_accepted`` says whether
         robots accept the published metadata.
         """
+        again = "sign its requests again, or revoke it" if self.is_lost else ""
         if self.state is State.REVOKED and not self.enclaves:
-            again = "sign its requests again, or revoke it"
-            return again if self.is_lost else "take it out of the fleet file"
+            return again or "take it out of the fleet file"
         if self._shows_wrong_clock(now, limit):
             return "check its clock"
         if self.state in (State.CURRENT, State.NONE):
             look = "check its server" if self.got_earlier_release else "look into it"
-            return look if self.problems else ""
+            return look if self.problems else again
         if self.is_ahead and (self.release or 0) > (self.published or 0):
             return "publish"
         if self.lacks_ca and self.state not in (State.BROKEN, *_SUSPICIOUS_STATES):
@@ -672,8 +675,8 @@ class FleetStatus:
         every robot with enclaves confirmed the current files in time, no restart is due, no agent
         reports a problem, robots can still fetch the published releases, no published file was
         altered in the last day, and there is no other doubt about the robots' files.  Robots whose
-        enclaves were all revoked do not count, unless a restored keystore lacks a certificate of
-        the robot that is not revoked.
+        enclaves were all revoked do not count, unless a restored keystore lacks an enclave of the
+        robot whose certificate is not revoked.
         """
         return self.is_settled()
 
@@ -1357,15 +1360,18 @@ class _KeystoreRecords:
         return tuple(sorted(name for name in names if not self._keystore.has_enclave(name)))
 
     def is_lost(self, compared_robot: _ComparedRobot, now: datetime | None) -> bool:
-        """Return whether a restored keystore lacks an enclave that has a certificate of its own.
+        """Return whether a restored keystore lacks an enclave of the robot that has a certificate.
 
         Messages or published releases showed the certificate, which is not revoked.  With ``now``,
         expired certificates do not count.
         """
-        if compared_robot.enclaves or not self.was_restored:
+        if not self.was_restored:
             return False
-        names = {*enclaves_of(self._fleet, compared_robot.robot)}
-        shown = KnownKeys(self._keystore).certificates_shown_after_restore(names)
+        names = enclaves_of(self._fleet, compared_robot.robot)
+        lacking = [name for name in names if not self._keystore.has_enclave(name)]
+        if not lacking:
+            return False
+        shown = KnownKeys(self._keystore).certificates_shown_after_restore(lacking)
         moment = iso(now) if now else ""
         return any(
             entry.serial not in self._revoked_serials and entry.not_after > moment
@@ -1734,7 +1740,7 @@ def _robot_status(
         reported=len(facts.reported),
         is_behind=bool(confirmed and confirmed.clock is RobotClock.BEHIND),
         has_low_sequence=bool(facts.refusal and facts.refusal.why.startswith(LOW_SEQUENCE)),
-        is_lost=facts.state is State.REVOKED and records.is_lost(compared_robot, now),
+        is_lost=records.is_lost(compared_robot, now),
     )
 
 

@@ -829,6 +829,39 @@ def test_what_the_ca_signed_counts_in_a_message_that_does_not(home: Home) -> Non
     assert r3.is_settled and not r2.is_settled
 
 
+def test_a_robot_with_a_certificate_that_the_keystore_lost_is_not_settled(home: Home) -> None:
+    """Nothing was revoked, and a robot can leave files out of its later messages."""
+    for made in ("ks", *ROBOTS):
+        shutil.rmtree(home.folder / made)
+    generate = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    home.run(*generate, "--robot", "r3")
+    home.run("create_enclave", "ks", "/r1/base")
+    backup = copy_of(home.root, home.folder / "backup")
+    home.run(*generate)
+    for robot in ROBOTS:
+        home.run("distribute_key", "ks", "--robot", robot, robot)
+    home.send("r1", enclave="/r1/arm")
+    home.send("r2")
+    shutil.rmtree(home.root)
+    backup.rename(home.root)
+    home.collect()
+    for robot in ("r1", "r3"):
+        home.run("distribute_key", "ks", "--robot", robot, robot, "--force")
+    shutil.rmtree(home.folder / "r1/enclaves/r1/arm")
+    home.send("r1")
+    home.send("r3")
+    home.collect()
+    status = fleet_status(OpenedKeystore(home.root))
+    assert [(of.state, of.is_settled, of.mended) for of in status.robots] == [
+        ("current", False, False),
+        ("none", False, False),
+        ("current", True, True),
+    ]
+    shown = sros("fleet", "status", "ks", cwd=home.folder).out
+    assert "lacks enclaves of r1, r2, whose certificates stay valid" in shown
+    assert len(re.findall("sign its requests again, or revoke it", shown)) == 2, shown
+
+
 def test_a_certificate_of_a_revoked_robot_is_revoked_when_it_becomes_known(home: Home) -> None:
     backup = copy_of(home.root, home.folder / "backup")
     home.run("renew", "ks", "/r2/base")
