@@ -2174,3 +2174,16 @@ def test_bins_grow_with_the_fleet(publisher: Home) -> None:
         sizes.append(len(now.bins))
         assert robot.gets()
     assert sizes == [2, 16, 64, 64]
+    # A keystore from a backup knows too low versions, also of the names that are not in use.
+    nothing = read_present(publisher.folder / "nothing", roots)
+    composer = MetadataComposer(
+        nothing,
+        signers,
+        known=dict.fromkeys(composer.versions, 0),
+        least=int(publisher.now.timestamp()),
+        expiry=MetadataExpiry(),
+        now=publisher.now,
+    )
+    for path, data in composer.compose(releases | more).files:
+        (publisher.pub / path).write_bytes(data)
+    assert robot.gets()
