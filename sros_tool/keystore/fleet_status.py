@@ -1080,7 +1080,8 @@ class _KeystoreRecords:
         missing = published.first_missing()
         unseen, refused = unseen_clause(missing), publication_problem(keystore)
         if not (unseen or refused) and (altered := published.first_altered()):
-            refused = f"'{published.folder}' has a changed archive: {altered}"
+            refused = f"'{published.folder}' has an archive that is changed or cannot be read: "
+            refused += altered
         self._published = published.robots
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
         """Maps robots to the number of the release that was published last for them."""

@@ -65,6 +65,7 @@ from sros_tool.pki.crl import SUPERSEDED, RevocationEntry, load_crl, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
 from sros_tool.validity import BACKDATE, iso, parse_iso
 from sros_tool.wording import capitalized
+from sros_tool.xml import read_bytes
 from tests.dds.signer_rows import signed_by
 from tests.support.harness import copy_of, create_request, policy_text, publish, sros
 from tests.support.messages import key_of, said_by, signed_message
@@ -1359,6 +1360,13 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     assert "not published yet" in sros("fleet", "status", "ks", cwd=home.folder).out
 
 
+def read_no_archive(path: Path, label: str, **limits: Any) -> bytes:
+    """Read a file, except an archive, as if its mode were 0."""
+    if label == "archive":
+        raise DocumentError(f"unable to read '{path}'")
+    return read_bytes(path, label, **limits)
+
+
 def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
     home: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1401,8 +1409,13 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
     for changed in (data[:-1] + bytes([data[-1] ^ 1]), data + b"x"):
         (pub / archive).write_bytes(changed)
         ended = sros(*status, cwd=home.folder)
-        assert f"'{pub}' has a changed archive: {archive}. Run {command}" in ended.out
+        clause = "has an archive that is changed or cannot be read"
+        assert f"'{pub}' {clause}: {archive}. Run {command}" in ended.out
         assert ended.status == 1
+    (pub / archive).write_bytes(data)
+    with monkeypatch.context() as unreadable:
+        unreadable.setattr("sros_tool.keystore.delivery.published.read_bytes", read_no_archive)
+        assert f"{clause}: targets" in sros(*status, cwd=home.folder).out
     (pub / archive).unlink()
     ended = sros(*status, cwd=home.folder)
     assert f"'{pub}' lacks {archive}, which robots fetch: run {command}\n" in ended.out

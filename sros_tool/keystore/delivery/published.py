@@ -158,17 +158,21 @@ class PublicationRecord:
     def first_altered(self) -> str:
         """Return the first archive in the publishing folder that is not as published, or "".
 
-        Archives that are missing or cannot be read are left out.
+        This includes archives that cannot be read; `first_missing` has those that are missing.
         """
         for name, robot in sorted(self.robots.items()) if self.folder else ():
             path, length = robot.release.path(name), robot.release.length
-            with suppress(SrosError, OSError):
+            try:
                 file = Path(self.folder, path)
                 if file.stat().st_size != length:
                     return path
                 data = read_bytes(file, "archive", max_bytes=length)
-                if hashlib.sha256(data).hexdigest() != robot.release.sha256:
-                    return path
+            except FileNotFoundError:
+                continue
+            except (SrosError, OSError):
+                return path
+            if hashlib.sha256(data).hexdigest() != robot.release.sha256:
+                return path
         return ""
 
     def document(self, now: datetime) -> bytes:
