@@ -797,12 +797,16 @@ class _Review:
     def _keystore_subject(self, path: str, folder: Path, before: Path | None) -> ReviewedSubject:
         """Return a keystore for the steps on requirements; ``before`` is the keystore of BASE.
 
+        A whole keystore in BASE is no export in HEAD: the enclaves that it lacks are removed.
+
         Raises:
             SrosError: the keystore cannot be read.
         """
         opened = {folder: OpenedKeystore(folder, lacks_keys=True)}
+        system = load_system(folder, replace(self._circumstances(), opened=opened))
+        was_whole = before is not None and OpenedKeystore(before).has_all_enclaves
         return ReviewedSubject(
-            load_system(folder, replace(self._circumstances(), opened=opened)),
+            replace(system, is_export=system.is_export and not was_whole),
             self._keystore_fleet(path),
             partial(load_side, before) if before else None,
             partial(load_side, folder),

@@ -1700,6 +1700,36 @@ def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path
     assert "has a private key" not in left
 
 
+@pytest.mark.parametrize("was_whole", [True, False])
+def test_no_change_makes_an_export_of_a_keystore(
+    change: Change, made_keystores: Path, was_whole: bool
+) -> None:
+    """Otherwise, an enclave that the change removes would count as one that an export lacks."""
+    copy_of(made_keystores / "before", change.folder / "ks")
+    must = '[[must]]\nenclave = "/b"\npublish = ["/y"]\n'
+    whole = {
+        "robot.toml": must,
+        "ks/ledger.jsonl": None,
+        "ks/ledger.p7s": None,
+        "ks/sros.toml": None,
+    }
+    exported = dict.fromkeys(("ks/enclaves/governance.p7s", "ks/enclaves/governance.xml"))
+    for link in [path for path in change.folder.glob("ks/enclaves/*/*") if path.is_symlink()]:
+        content = link.read_bytes()
+        link.unlink()
+        link.write_bytes(content)
+    shutil.rmtree(change.folder / "ks/private", ignore_errors=True)
+    change.base = change.commit(whole if was_whole else whole | exported)
+    shutil.rmtree(change.folder / "ks/enclaves/b")
+    change.commit(exported if was_whole else {})
+    ended = change.review("--keystore", "ks", "--requirements", "robot.toml")
+    if was_whole:
+        assert ended.status == 1 and "/b: does not exist, but /b has to be" in ended.out, ended
+        assert "of-export" not in ended.out
+    else:
+        assert "[ok] requirements ks: 1 note" in ended.out and "of-export" in ended.out, ended
+
+
 def test_what_is_new_included_or_cannot_fail(change: Change) -> None:
     included = (change.folder / "common/node.xml").read_text()
     change.commit({"common/node.xml": f"{included}<!-- more -->\n"})
