@@ -629,9 +629,9 @@ PROCESS_COPIED_ENCLAVE = FindingKind(
     "Whoever has a copy of an enclave's files has all its rights. Files that are delivered to one "
     "folder, such as a revocation list, do not reach processes from the other folder.",
     "rcl 9 (rcl/src/rcl/security.c): ROS_SECURITY_KEYSTORE names the folder.",
-    "If you did not start the process, stop it, and replace the key of the enclave "
-    "(docs/howto/rotate.md, A key in wrong hands). Otherwise start both processes from one folder, "
-    "and remove the copy.",
+    "Stop the process that you did not start, and replace the key of the enclave "
+    "(docs/howto/rotate.md, A key in wrong hands). If you started both processes, start them from "
+    "one folder, and remove the copy.",
 )
 ZENOH_UNREAD = FindingKind(
     "runtime.zenoh-process-unread",
@@ -755,9 +755,10 @@ def security_counts_text(running: RunningProcesses) -> str:
     if not (counts or unseen):
         return ""
     secured = [node for node, of_node in security if of_node is Security.SECURED]
-    folders = Counter(f"'{_keystore(node)}'" for node in secured)
-    numbers = [f"{folder} ({number})" for folder, number in folders.most_common()]
-    whence = f"; secured from {enumerated(numbers)}" if len({*map(_folder_of, secured)}) > 1 else ""
+    folders = Counter(map(_folder_of, secured))
+    names = {_folder_of(node): _keystore_text(node) for node in secured}
+    numbers = [f"{names[folder]} ({number})" for folder, number in folders.most_common()]
+    whence = f"; secured from {enumerated(numbers)}" if len(numbers) > 1 else ""
     return f"processes that use ROS 2, DDS or Zenoh: {', '.join(texts)}{unseen}{whence}"
 
 
@@ -817,12 +818,12 @@ def process_findings(
     starts_nodes = is_secured_here and bool(environment.get(ENCLAVE))
     yield from _mixed_vendor_findings(secured, environment if starts_nodes else None)
     yield from _other_keystore_findings(secured, environment if is_secured_here else None)
+    root = Path(environment[KEYSTORE]) if is_secured_here and environment.get(KEYSTORE) else None
     for _, processes in group_by_authorities(secured):
-        yield from _copied_enclave_findings(processes)
+        yield from _copied_enclave_findings(processes, root)
         connections = connections_between(with_time_to_connect(processes, now))
         yield from connection_findings(connections.missing)
-    if is_secured_here and environment.get(KEYSTORE):
-        root = Path(environment[KEYSTORE])
+    if root:
         copies = (node for node in nodes if node.enclave and has_other_files(node.enclave, root))
         yield from other_folder_findings(copies, root)
     yield from _different_security_findings(nodes, security)
@@ -1085,30 +1086,59 @@ def _other_keystore_findings(
             yield PROCESS_OTHER_KEYSTORE.found(process.label, text)
 
 
-def _copied_enclave_findings(processes: Sequence[Process]) -> Iterator[Finding]:
+def _copied_enclave_findings(
+    processes: Sequence[Process], original: Path | None
+) -> Iterator[Finding]:
     """Yield a finding for each process whose enclave another process loaded from another folder.
 
-    ``processes`` trust the same identity CA.  The folder with the most processes counts as the
-    original.
+    The name of an enclave shows that it is the same, and so does the key, because a copy can have
+    another name.  ``processes`` trust the same identity CA.  Without an ``original`` keystore, the
+    folder with the most processes counts as the original.
     """
-
     numbers = Counter(map(_folder_of, processes))
-    first: dict[str, Process] = {}
-    for process in sorted(processes, key=lambda each: (-numbers[_folder_of(each)], each.pid)):
+
+    def rank(process: Process) -> tuple[bool, int, int]:
+        is_original = original and process.enclave and _is_inside(process.enclave, original)
+        return (not is_original, -numbers[_folder_of(process)], process.pid)
+
+    first: dict[object, Process] = {}
+    for process in sorted(processes, key=rank):
         assert process.enclave
-        name = f"/{process.enclave.name.strip('/')}"
-        other = first.setdefault(name, process)
-        if _folder_of(other) != _folder_of(process):
-            text = (
-                f"it runs in {plain(name, _LONGEST_PATH)} from '{_keystore(process)}', and "
-                f"{other.label} from '{_keystore(other)}'"
-            )
-            yield PROCESS_COPIED_ENCLAVE.found(process.label, text)
+        name = _enclave_name(process.enclave)
+        marks = [name, *_public_keys(_certificates_in(process.enclave, CERTIFICATE_FILE))]
+        for other in [first.setdefault(mark, process) for mark in marks]:
+            assert other.enclave
+            if other.enclave.folders[-1:] != process.enclave.folders[-1:]:
+                other_name = _enclave_name(other.enclave)
+                text = (
+                    f"it runs in {name} from {_keystore_text(process)}, and {other.label}"
+                    f"{f' in {other_name}' * (other_name != name)} from {_keystore_text(other)}"
+                )
+                yield PROCESS_COPIED_ENCLAVE.found(process.label, text)
+                break
+
+
+def _is_inside(enclave: ProcessEnclave, keystore: Path) -> bool:
+    """Return whether an enclave is in a keystore, and its name does not lead out of it."""
+    return ".." not in enclave.name.split("/") and enclave.is_in_keystore(keystore)
+
+
+def _enclave_name(enclave: ProcessEnclave) -> str:
+    return plain(f"/{enclave.name.strip('/')}", _LONGEST_PATH)
 
 
 def _folder_of(process: Process) -> object:
     """Return a value that is the same for all processes whose enclaves are in one folder."""
-    return (process.enclave and process.enclave.folders[:1]) or _keystore(process)
+    enclave = process.enclave
+    return enclave and (enclave.folders[:1] or enclave.keystore)
+
+
+def _keystore_text(process: Process) -> str:
+    """Return which keystore a secured process uses, also if this shell sees another one there."""
+    if not process.enclave:
+        return "an unknown folder"
+    is_elsewhere = process.enclave.is_there and not process.enclave.local_keystore
+    return f"'{_keystore(process)}'{' of its own file system' * is_elsewhere}"
 
 
 def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterator[Finding]:
@@ -1117,7 +1147,7 @@ def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterato
         assert process.enclave
         root = _plain_path(process.enclave.keystore)
         other = f"'{root}' of its own file system" if root == str(folder) else f"'{root}'"
-        name = plain(f"/{process.enclave.name.strip('/')}", _LONGEST_PATH)
+        name = _enclave_name(process.enclave)
         text = f"it runs in {name} from {other}, not from '{folder}'"
         yield PROCESS_OTHER_FOLDER.found(process.label, text)
 

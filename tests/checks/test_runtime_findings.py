@@ -187,6 +187,48 @@ def test_the_same_files_in_another_folder_are_no_other_files(
     assert not ids(running(0, **{KEYSTORE: copy})(sound_one, bench))
 
 
+def test_a_thief_neither_hides_by_a_name_nor_accuses_the_robot_by_its_number_of_processes(
+    sound_one: RuntimeState, bench: Bench
+) -> None:
+    """Without security in this shell, the number decides."""
+    kind = "runtime.process-copied-enclave"
+    thief, node, _ = CASES[kind](sound_one, bench).running.processes
+    own, copy = node.environment[KEYSTORE], Path(thief.environment[KEYSTORE])
+    (copy / "enclaves/base").rename(copy / "enclaves/other")
+    outside = f"{'/..' * 99}{copy}/enclaves/other"
+
+    def found_in(state: RuntimeState) -> list[tuple[str, str]]:
+        findings = runtime_findings(seen(state))
+        return [(each.subject, each.text) for each in findings if each.id == kind]
+
+    for keystore, name in ((f"{copy}", "/other"), (own, outside)):
+        stolen = {**thief.environment, KEYSTORE: keystore, ENCLAVE: name}
+        thieves = [replace(thief, pid=pid, environment=stolen) for pid in (5, 6)]
+        state = with_processes(sound_one, *thieves, node)
+        ((subject, text),) = found_in(state)
+        assert subject == ", ".join(process.label for process in thieves)
+        assert text.endswith(f", and {node.label} in /base from '{own}'")
+        more = found_in(replace(state, environment={}))
+        assert [subject for subject, _ in more] == [node.label]
+
+
+def test_the_first_line_names_folders_that_have_one_path_or_none(
+    sound_one: RuntimeState, bench: Bench
+) -> None:
+    """A container can have another folder at the same path; Zenoh needs no keystore."""
+    (node, *_) = seen(sound_one).running.processes
+    own = node.environment[KEYSTORE]
+    assert node.enclave
+    elsewhere = replace(node.enclave, folders=((0, 1), (0, 2)), local_keystore=None)
+    counts = security_counts_text(RunningProcesses((node, node, replace(node, enclave=elsewhere))))
+    assert counts.endswith(f"; secured from '{own}' (2) and '{own}' of its own file system (1)")
+    unset = dict.fromkeys((ENABLE, STRATEGY, KEYSTORE, ENCLAVE))
+    zenoh = seen(on_zenoh(**unset)(sound_one, bench)).running.processes[0]
+    assert security_counts_text(RunningProcesses((zenoh,))).endswith("1 secured, 0 open")
+    counts = security_counts_text(RunningProcesses((node, zenoh)))
+    assert counts.endswith(f"; secured from '{own}' (1) and an unknown folder (1)")
+
+
 def test_nothing_on_zenoh_with_a_session_file(sound_one: RuntimeState, bench: Bench) -> None:
     assert ids(on_zenoh()(sound_one, bench)) == {"zenoh.unsigned"}
     other_router = {OVERRIDE: 'connect/endpoints=["tls/robot:7447"];transport/link/tx/lease=9'}
