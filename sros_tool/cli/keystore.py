@@ -499,19 +499,28 @@ def _list_enclaves_of_policies(
     if robots and not fleet_file:
         raise UsageError("--robot needs --fleet for a policy", "", "Add --fleet FILE.")
     robot_of: dict[str, str] | None = None
+    chosen = set[str]()
     if fleet_file:
         policies = fleet_policies(files, fleet_file, robots)
+        if robots:
+            chosen.update(name for policy in policies for name in policy)
+        if robots and patterns:  # both are added up, as for a keystore
+            policies = fleet_policies(files, fleet_file)
         stated = {name: policy.stated_enclave(name)[1] for policy in policies for name in policy}
         robot_of = {name: robot.name for name, robot in stated.items() if robot}
         names = {*stated}
     else:
         names = {enclave.path for file in files for enclave in read_policy(file).enclaves}
     for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in names):
-            raise UsageError(f"no enclave of the policies matches {pattern!r}")
-    listed = sorted(
-        name for name in names if not patterns or any(fnmatchcase(name, p) for p in patterns)
-    )
+        fitting = {name for name in names if fnmatchcase(name, pattern)}
+        if not fitting:
+            raise UsageError(
+                f"no enclave of the policies matches {pattern!r}",
+                "",
+                "List them all: repeat this command without --match and --robot.",
+            )
+        chosen |= fitting
+    listed = sorted(chosen if patterns or robots else names)
     if robot_of is not None:
         robot_of = {name: robot_of[name] for name in listed if name in robot_of}
     if as_json:

@@ -463,6 +463,8 @@ def test_the_enclaves_that_policies_give_a_robot_are_listed(tmp_path: Path) -> N
     assert listed(*options, "--match", "*base", "--match", "/o*").ok().out.split() == [
         *("/office", "/r1/base", "/r2/base")
     ]
+    added_up = listed(*options, "--match", "*hand", "--robot", "r2").ok().out
+    assert added_up == "/r1/hand\n/r2/arm\n/r2/base\n", "as for a keystore"
     found = json.loads(listed(*options, "--match", "*hand", "--json").ok().out)
     assert (found["keystore"], found["robots"]) == (None, {"/r1/hand": "r1"})
     for wrong in (("ks", *options), ("-p", "p.xml", "--robot", "r1"), ("--fleet", "f.toml")):
