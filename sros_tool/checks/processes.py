@@ -819,8 +819,10 @@ def process_findings(
     yield from _mixed_vendor_findings(secured, environment if starts_nodes else None)
     yield from _other_keystore_findings(secured, environment if is_secured_here else None)
     root = Path(environment[KEYSTORE]) if is_secured_here and environment.get(KEYSTORE) else None
-    for _, processes in group_by_authorities(secured):
+    perhaps_secured = (node for node in nodes if security[node.pid] is not Security.OPEN)
+    for _, processes in group_by_authorities(perhaps_secured):
         yield from _copied_enclave_findings(processes, root)
+    for _, processes in group_by_authorities(secured):
         connections = connections_between(with_time_to_connect(processes, now))
         yield from connection_findings(connections.missing)
     if root:

@@ -205,7 +205,9 @@ def test_a_thief_neither_hides_by_a_name_nor_accuses_the_robot_by_its_number_of_
         stolen = {**thief.environment, KEYSTORE: keystore, ENCLAVE: name}
         thieves = [replace(thief, pid=pid, environment=stolen) for pid in (5, 6)]
         state = with_processes(sound_one, *thieves, node)
+        without_rcl = replace(node, libraries=frozenset({"libfastrtps"}))
         ((subject, text),) = found_in(state)
+        assert found_in(with_processes(state, *thieves, without_rcl)) == [(subject, text)]
         assert subject == ", ".join(process.label for process in thieves)
         assert text.endswith(f", and {node.label} in /base from '{own}'")
         more = found_in(replace(state, environment={}))
