@@ -9,6 +9,7 @@ import pytest
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies.policy import policy_file_findings
 from sros_tool.files import policies_dir
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.spelling import NearNames
 from tests.checks.policy_cases import services, topics
 
@@ -228,3 +229,21 @@ def test_two_servers_of_a_service(tmp_path: Path, server: str, other: str, found
     used = services("request", "/_server/home", "/clear")
     used += EXECUTE.format("/_server/go").replace("execute", "call")
     assert len(sides(tmp_path / "p.xml", server + used, other, SEVERAL)) == found
+
+
+@pytest.mark.parametrize(("groups", "found"), [(("", ""), 2), ((":g1", ":g2"), 0)])
+def test_two_servers_on_one_robot_of_a_fleet(
+    tmp_path: Path, groups: tuple[str, str], found: int
+) -> None:
+    """Twin: robots in other ROS domains may have servers, and nodes, with the same names."""
+    file = tmp_path / "p.xml"
+    offer = services("reply", "/clear")
+    enclaves = (
+        f'<enclave path="/{{robot{group}}}/{name}"><profiles><profile ns="/" node="n">{offer}'
+        "</profile></profiles></enclave>"
+        for group, name in zip(groups, "ab", strict=True)
+    )
+    file.write_text(f'<policy version="0.2.0"><enclaves>{"".join(enclaves)}</enclaves></policy>')
+    fleet = Fleet.of(Robot(f"r{n}", "/", n, groups=(f"g{n}",)) for n in (1, 2))
+    seen = [of.id for of in policy_file_findings(file, fleet=fleet)]
+    assert (seen.count(SEVERAL), seen.count("policy.node-in-two-enclaves")) == (found, found)

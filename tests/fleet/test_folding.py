@@ -248,6 +248,7 @@ def test_a_review_is_folded(tmp_path: Path) -> None:
     wide = policy_text(
         {"/{robot}/nav": publish("{namespace}/go"), "/{robot}/base": subscribe("{namespace}/go")}
     ).replace('ns="/"', 'ns="{namespace}"')
+    wide = wide.replace('node="n"', 'node="m"', 1)
     robots = "".join(f"r{number} = {{}}\n" for number in range(6))
     files = {"fleet.toml": f"[robots]\n{robots}", "r.toml": APART}
     change.commit({"p.xml": wide.replace("{namespace}/go", "go"), **files})

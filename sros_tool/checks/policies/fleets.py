@@ -5,10 +5,14 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from itertools import chain
 
 from sros_tool.checks.kind import WARNING, Finding, FindingKind
+from sros_tool.checks.policies.counterparts import check_servers
+from sros_tool.checks.policies.enclaves import node_in_two_enclaves_findings
+from sros_tool.checks.policies.statements import CheckedPolicy
 from sros_tool.fleet.robots import Fleet, Robot, group_of, robot_of
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.policy.placeholders import parts_of
@@ -66,6 +70,25 @@ def fleet_findings(
     if has_all_policies and (text := _unknown_groups_clause(groups, fleet)):
         yield UNKNOWN_GROUP.found(file, text, file)
     yield from _written_out_robot_findings(enclaves, fleet)
+    for of_robot in _enclaves_of_one_robot(fleet, enclaves):
+        yield from node_in_two_enclaves_findings(of_robot)
+        yield from check_servers(CheckedPolicy(replace(policies[0], enclaves=tuple(of_robot))))
+
+
+def _enclaves_of_one_robot(
+    fleet: Fleet, enclaves: Iterable[Enclave]
+) -> Iterable[Sequence[Enclave]]:
+    """Return the enclaves of the first robot of all robots in the same groups.
+
+    The others have the same enclaves, with other values of the placeholders.
+    """
+    first: dict[tuple[str, ...], str] = {}
+    by_robot: dict[str, list[Enclave]] = defaultdict(list)
+    for enclave in enclaves:
+        if robot := robot_of(fleet, enclave.path):
+            first.setdefault(robot.groups, robot.name)
+            by_robot[robot.name].append(enclave)
+    return [by_robot[name] for name in first.values()]
 
 
 def _shared_namespaces(fleet: Fleet, enclaves: Iterable[Enclave]) -> Iterator[str]:

@@ -68,7 +68,8 @@ def findings_in(
     """Yield all findings in the parsed policies of a robot, except the findings about includes.
 
     A name may have its counterpart in any of the policies.  With ``of_fleet``, the policies are for
-    several robots, whose nodes may have the same names in different ROS domains.
+    several robots, whose nodes may have the same names in different ROS domains; `fleet_findings`
+    compares the enclaves of one robot.
     """
     checked = [CheckedPolicy(policy, distribution) for policy in policies]
     for checked_policy in checked:
