@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from shlex import quote
 
@@ -39,11 +39,11 @@ def path_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[F
     findings: list[Finding] = []
     policies, paths = [], tuple(paths)
     for path in paths:
-        findings_at_path = _findings_unless_policy(path, circumstances)
-        if findings_at_path is None:
-            policies.append(path)
+        check = _check_of(path)
+        if check:
+            findings += check(path, circumstances)
         else:
-            findings += findings_at_path
+            policies.append(path)
     if policies:
         findings += policy_findings(policies, circumstances)
     findings += findings_between_folders(paths, circumstances)
@@ -69,21 +69,34 @@ def findings_between_folders(paths: Iterable[Path], circumstances: Circumstances
     )
 
 
-def _findings_unless_policy(path: Path, circumstances: Circumstances) -> list[Finding] | None:
-    """Return the findings at a path; None if it has to be a policy, or a folder of policies."""
-    if path.suffix in (".json5", ".json", ".yaml", ".yml") and not path.is_dir():
-        from sros_tool.checks.zenoh import configuration_findings
+def is_of_policies(path: Path) -> bool:
+    """Return whether a path has to be a policy, or a folder of policies: it is nothing else."""
+    return _check_of(path) is None
 
-        return list(configuration_findings(path))
+
+def _check_of(path: Path) -> Callable[[Path, Circumstances], list[Finding]] | None:
+    """Return the check of a path; None if it has to be a policy, or a folder of policies."""
+    if path.suffix in (".json5", ".json", ".yaml", ".yml") and not path.is_dir():
+        return _zenoh_findings
     if is_keystore(path):
-        return findings_in_keystore(path, circumstances)
+        return findings_in_keystore
     enclave = path if path.is_dir() else path.parent
     if (is_enclave(enclave) or (enclave / PERMISSIONS_FILE).exists()) and (
         path.is_dir() or path.name in _ENCLAVE_FILES
     ):
-        root, name = locate_enclave(enclave)
-        return findings_in_keystore(root, circumstances, name)
+        return _enclave_findings
     return None
+
+
+def _zenoh_findings(path: Path, _circumstances: Circumstances) -> list[Finding]:
+    from sros_tool.checks.zenoh import configuration_findings
+
+    return list(configuration_findings(path))
+
+
+def _enclave_findings(path: Path, circumstances: Circumstances) -> list[Finding]:
+    root, name = locate_enclave(path if path.is_dir() else path.parent)
+    return findings_in_keystore(root, circumstances, name)
 
 
 def policy_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:

@@ -481,9 +481,9 @@ def _is_option_given(parameter: str) -> bool:
 
 
 def _are_policies(family: str, paths: tuple[Path, ...]) -> bool:
-    from sros_tool.keystore.layout import is_keystore
+    from sros_tool.checks.targets import is_of_policies
 
-    return family in ("", "policy") and bool(paths) and not any(map(is_keystore, paths))
+    return family in ("", "policy") and bool(paths) and all(map(is_of_policies, paths))
 
 
 def _policies_or_keystore(family: str, paths: tuple[Path, ...], option: str) -> list[Path]:

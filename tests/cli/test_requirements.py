@@ -306,11 +306,14 @@ def test_two_enclaves_with_a_right_are_proposed_by_name(tmp_path: Path) -> None:
         (("required.toml", "--requirements", "required.toml"), "required.toml"),
         (("robot.xml", "--requirements-before", "required.toml"), "needs --requirements"),
         (("runtime", "--template", "production"), "--template is for policies that are not"),
+        (("signed", "--template", "production"), "--template is for policies that are not"),
         (("robot.xml", "--suggest", "--json"), "--suggest prints TOML"),
         (("robot.xml", "--suggest", "--requirements", "required.toml"), "--suggest prints TOML"),
     ],
 )
 def test_what_is_refused(words: tuple[str, ...], says: str, folder: Path) -> None:
+    (folder / "signed").mkdir(exist_ok=True)  # the folder of an enclave
+    (folder / "signed/permissions.p7s").touch()
     ended = sros("check", *words, cwd=folder)
     assert ended.status == 2
     assert says in ended.err
