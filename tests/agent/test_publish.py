@@ -266,7 +266,10 @@ def test_a_damaged_archive_is_published_again(
 
 @pytest.mark.parametrize("whole", [False, True])
 def test_a_folder_that_went_back_is_published_again_and_shown(publisher: Home, whole: bool) -> None:
-    """With all its files, or only the timestamp; each time, one run shows it, and the next not."""
+    """With all its files, or only the timestamp; each time, one run shows it, and the next not.
+
+    The earlier timestamp does not hide that an archive was altered.
+    """
     earlier = publisher.kept("earlier")
     publisher.run("renew", "ks", "/r1/base")
     publisher.publish()
@@ -275,9 +278,13 @@ def test_a_folder_that_went_back_is_published_again_and_shown(publisher: Home, w
         earlier.rename(publisher.pub)
     else:
         shutil.copy(earlier / "metadata/timestamp.json", publisher.pub / "metadata")
+        release = read_published(OpenedKeystore(publisher.root)).robots["r1"].release
+        (publisher.pub / release.path("r1")).write_text("altered")
     result = publisher.publish()
-    assert [note.id for note in result.notes] == ["fleet.metadata-older"]
-    assert_shown_for_a_day(publisher, result, "metadata/timestamp.json")
+    damaged = [] if whole else ["fleet.archive-damaged"]
+    assert [note.id for note in result.notes] == [*damaged, "fleet.metadata-older"]
+    altered = [] if whole else ["robots/r1.tar.gz"]
+    assert_shown_for_a_day(publisher, result, *altered, "metadata/timestamp.json")
     publisher.robot().gets()
 
 
@@ -404,14 +411,14 @@ def test_damaged_root_metadata_in_the_keystore(publisher: Home, content: str) ->
         assert "publish to another folder" in refused.err
 
 
-def assert_shown_for_a_day(publisher: Home, result: PublishedFleet, file: str) -> None:
-    """Assert that a run which published a file again ends with 1, and the status has the file."""
-    assert result.altered == [file] and not result.is_complete(publisher.now)
+def assert_shown_for_a_day(publisher: Home, result: PublishedFleet, *files: str) -> None:
+    """Assert that a run which published files again ends with 1, and the status has the files."""
+    assert result.altered == [*files] and not result.is_complete(publisher.now)
     for hours, is_shown in ((1, True), (22, True), (2, False)):
         done = publisher.publish(after=timedelta(hours=hours))
         assert not done.altered and done.is_complete(publisher.now)
         status = fleet_status(OpenedKeystore(publisher.root)).with_overdue(publisher.now)
-        assert status.publication and list(status.publication.altered) == [file] * is_shown
+        assert status.publication and sorted(status.publication.altered) == sorted(files) * is_shown
 
 
 def test_a_private_key_in_a_file_that_would_be_published(publisher: Home) -> None:

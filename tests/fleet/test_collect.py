@@ -696,6 +696,12 @@ def test_a_revoked_robot_that_is_still_in_the_fleet(
         assert [robot.outcome for robot in home.collect().robots] == ["missing", "revoked", "kept"]
     found = json.loads(sros("fleet", "status", "ks", "--json", cwd=home.folder).out)
     assert found["robots"][1]["state"] == "revoked" and "r2" not in found["overdue"]
+    fleet = home.folder / "fleet.toml"
+    fleet.write_text(re.sub("r2 = .*", "", fleet.read_text()))
+    home.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    home.put("r2", b"hostile")
+    (note,) = home.collect().notes
+    assert note.id == "fleet.revoked-in-inbox" and "has messages of r2, not" in note.text
 
 
 def test_a_certificate_of_the_ca_that_a_rotation_replaces(home: Home) -> None:

@@ -306,7 +306,7 @@ def collect(
         dry_run,
         [*changes, *signed],
         [
-            *_unknown_file_notes(inbox, fleet, is_older=is_older),
+            *_unknown_file_notes(inbox, fleet, OpenedKeystore(root), is_older=is_older),
             *_older_message_notes(inbox, taken),
             *notes,
         ],
@@ -492,15 +492,30 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
     return _File(data, time_of_file(state.st_mtime))
 
 
-def _unknown_file_notes(inbox: Path, fleet: Fleet, *, is_older: bool) -> Iterator[Note]:
-    """Yield a note on names in the inbox that are not names of robots.
+def _unknown_file_notes(
+    inbox: Path, fleet: Fleet, keystore: OpenedKeystore, *, is_older: bool
+) -> Iterator[Note]:
+    """Yield notes on names in the inbox that are not names of robots.
 
     ``is_older`` says that the keystore was restored, so that its fleet may lack robots.
     """
     names: list[str] = []
     with suppress(OSError), os.scandir(inbox) as entries:  # others can move the folder at any time
         names = sorted(entry.name for entry in islice(entries, _MOST_NAMES))
-    unknown = [ascii(name)[1:-1] for name in names if name not in fleet.robots]
+    parts = set[str]()
+    for entry in keystore.entries_of("revocation"):
+        if entry.reason != SUPERSEDED:
+            parts.update(entry.enclave.split("/"))
+    if revoked := [name for name in names if name in parts and name not in fleet.robots]:
+        yield Note(
+            "fleet.revoked-in-inbox",
+            f"'{inbox}' has messages of {first_few(revoked, _SHOWN)}, not in the fleet any more, "
+            "whose enclaves were revoked. They are not read: delete them. If you have such a robot "
+            "back, see docs/howto/one_robot.md (Back in service).",
+        )
+    unknown = [
+        ascii(name)[1:-1] for name in names if name not in fleet.robots and name not in revoked
+    ]
     if unknown:
         verb = "is" if len(unknown) == 1 else "are"
         left = "If a robot left the fleet, delete its messages there."

@@ -1173,7 +1173,16 @@ class _Publication:
             if not before or before.files != state or not has_files:
                 changed_robots.append(_ChangedRobot(robot, names, state))
             was_here = before and self._present_releases.get(robot) == before.release
-            if before and not has_files and (was_here or self._mends_metadata):
+            # An interrupted run can leave an archive out, but not leave other content in its place.
+            if (
+                before
+                and not has_files
+                and (
+                    was_here
+                    or self._mends_metadata
+                    or os.path.lexists(self._folder / before.release.path(robot))
+                )
+            ):
                 self._damaged.add(robot)
         known = self.list.robots.keys() | self._present_releases.keys()
         gone = (known if among is None else looked_at) - wanted
