@@ -59,6 +59,7 @@ from sros_tool.policy.merge import (
     kept_rights_notes,
     merge_all,
     merge_into,
+    undenied_rights,
 )
 from sros_tool.policy.model import (
     ALLOW,
@@ -75,7 +76,7 @@ from sros_tool.policy.model import (
     policy_of_nodes,
     stated_protections,
 )
-from sros_tool.policy.remapping import remapped_policies
+from sros_tool.policy.remapping import parse_remapping, remapped_policies, remapped_policy
 from sros_tool.policy.rights import Right, Rules, order, policy_rights, profile_rights
 from sros_tool.translate import refuse_contradictions, ros_rights
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
@@ -1085,7 +1086,16 @@ def merge_policies(
     if enclave is not None:
         check_enclave_name(enclave)
         additions = [policy_in_enclave(addition, enclave) for addition in additions]
-    merged = merge_all(path, additions)
+    rules = [parse_remapping(text) for text in remaps]
+
+    def moved(policy: Policy) -> Policy:
+        if namespace is not None:
+            policy = policy_in_namespace(policy, namespace)
+        policy, _ = remapped_policy(policy, rules)
+        return policy_in_enclave(policy, enclave) if enclave is not None else policy
+
+    undenied = (undenied_rights(policy, moved) for policy in others)
+    merged = merge_all(path, additions, frozenset().union(*undenied))
     protections = stated_protections(present.enclaves)
     added = (stated for addition in additions for stated in stated_protections(addition.enclaves))
     refuse_contradictions((*protections, *added), known=protections)

@@ -14,8 +14,9 @@ import codecs
 import re
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from typing import NamedTuple
 from lxml import etree
 
 from sros_tool.errors import DocumentError, Note, PolicyError
-from sros_tool.names import GLOBAL_TOPICS, check_namespace, expand, only_reads
+from sros_tool.names import GLOBAL_TOPICS, check_namespace, expand, is_expression, only_reads
 from sros_tool.policy.document import instruction_text, read_policy
 from sros_tool.policy.model import (
     ALLOW,
@@ -32,6 +33,7 @@ from sros_tool.policy.model import (
     Enclave,
     Level,
     Policy,
+    Profile,
     Qualifier,
     nodes_in_several_enclaves,
     nodes_in_several_namespaces,
@@ -48,6 +50,7 @@ from sros_tool.policy.rights import (
     join_actions,
     lost_counterparts_text,
     order,
+    parts,
     policy_rights,
     profile_rights,
     rights_without_counterpart,
@@ -64,8 +67,9 @@ _MOST_SHOWN = 3
 class Contradiction:
     """A right that the policy file allows and a merged policy denies, or the reverse.
 
-    Another case is a merged policy that allows the right to a node, and denies the right to another
-    node of the same enclave.  The denial may concern only a part of the right.  The denial always
+    Other cases are a merged policy that allows the right to a node, and denies the right to another
+    node of the same enclave, and a right that its own policy denies only since names moved (by
+    --remap, for example).  The denial may concern only a part of the right.  The denial always
     decides.
     """
 
@@ -105,18 +109,20 @@ class MergePlan:
     contradictions: tuple[Contradiction, ...]
 
 
-def plan_merge(before: Policy, additions: Policy) -> MergePlan:
+def plan_merge(before: Policy, additions: Policy, undenied: Collection[Right] = ()) -> MergePlan:
     """Return the plan for adding the rights of ``additions`` that ``before`` lacks.
 
     Left out are rights that any profile or wildcard of the enclave already allows, and rights that
-    the enclave completely denies.
+    the enclave completely denies.  A denial of ``additions`` itself contradicts the rights in
+    ``undenied``: it denied them only since names moved.
     """
-    return _Planner(before, additions).plan()
+    return _Planner(before, additions, undenied).plan()
 
 
 class _Planner:
-    def __init__(self, before: Policy, additions: Policy) -> None:
+    def __init__(self, before: Policy, additions: Policy, undenied: Collection[Right]) -> None:
         self._additions = additions
+        self._undenied = frozenset(undenied)
         self._file = Rules(policy_rights(before))
         self._asked = Rules(policy_rights(additions))
         self._wanted: dict[Right, bool] = {}
@@ -145,7 +151,8 @@ class _Planner:
             if place_names
         }
         added = [right for right, wanted in self._wanted.items() if wanted]
-        return MergePlan(entries, tuple(sorted(added, key=order)), tuple(self._contradictions))
+        contradictions = tuple(dict.fromkeys(self._contradictions))
+        return MergePlan(entries, tuple(sorted(added, key=order)), contradictions)
 
     def _is_wanted(self, right: Right) -> bool:
         known = self._wanted.get(right)
@@ -165,6 +172,10 @@ class _Planner:
             # A denial that both policies state is no contradiction.
             if not self._asked.cover(denied):
                 self._contradictions.append(Contradiction(denied, right, False))
+        if right in self._undenied:
+            for denied in join_actions(_denials_of_a_part(self._asked, right)):
+                is_new = not self._file.cover(denied)
+                self._contradictions.append(Contradiction(denied, right, is_new))
         return not (self._file.cover(right) or self._file.cover(denial))
 
     def _contradictions_between_nodes(self, enclave: Enclave) -> Iterator[Contradiction]:
@@ -193,6 +204,47 @@ class _Planner:
             }
             for allowed in join_actions(overridden):
                 yield Contradiction(denied, allowed, self._is_wanted(denied))
+
+
+def _denials_of_a_part(rules: Rules, right: Right) -> Iterator[Right]:
+    """Yield the denials that deny an ALLOW, or one of the parts of an action, for all its names."""
+    for part in parts(right):
+        yield from rules.covering_rights(part._replace(qualifier=DENY))
+
+
+def undenied_rights(policy: Policy, move: Callable[[Policy], Policy]) -> frozenset[Right]:
+    """Return the ALLOW rights that ``policy`` does not itself deny, with the names after ``move``.
+
+    If ``policy`` denies nothing, the result is empty.  For a right with wildcards, ``move`` may add
+    new names; these are left out.
+    """
+    stated = policy_rights(policy)
+    if not any(right.qualifier is DENY for right in stated):
+        return frozenset()
+    rules = Rules(stated)
+    rights = set[Right]()
+    for with_wildcards in (False, True):
+
+        def of_profile(enclave: str, profile: Profile, wildcards: bool) -> Profile:
+            groups = (
+                replace(group, rights=((right, qualifier),), names=(name,), lines=())
+                for group in profile.groups
+                for right, qualifier in group.rights
+                if qualifier is ALLOW
+                for name in group.names
+                if (full := expand(name, profile.ns, profile.node))
+                and is_expression(full) is wildcards
+                and not any(_denials_of_a_part(rules, Right(enclave, ALLOW, right, full)))
+            )
+            return replace(profile, groups=tuple(groups))
+
+        enclaves = (
+            enclave.with_profiles(partial(of_profile, enclave.path, wildcards=with_wildcards))
+            for enclave in policy.enclaves
+        )
+        moved = policy_rights(move(replace(policy, enclaves=tuple(enclaves))))
+        rights |= {e for e in moved if is_expression(e.name) is with_wildcards}
+    return frozenset(rights)
 
 
 @dataclass(slots=True)
@@ -475,7 +527,7 @@ class MergedPolicy(NamedTuple):
     added: Sequence[Right]
     """Rights that the merge adds to the policy file."""
     contradictions: Sequence[Contradiction]
-    """Rights that one of the policies allows and another denies; the DENY wins."""
+    """Rights that a policy allows, and another or the same one denies; the DENY wins."""
     output: Path | None
     """Path of the file that was written, or null."""
     document: str | None
@@ -496,8 +548,11 @@ def merge_into(path: Path, additions: Policy) -> Merged:
     return merge_all(path, (additions,))
 
 
-def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
-    """Return the file at ``path`` with several policies merged in order; write nothing."""
+def merge_all(path: Path, policies: Iterable[Policy], undenied: Collection[Right] = ()) -> Merged:
+    """Return the file at ``path`` with several policies merged in order; write nothing.
+
+    For ``undenied``, see `plan_merge`.
+    """
     document, policies = read_bytes(path, "policy file"), tuple(policies)
     first = before = read_policy(path, document, may_be_empty=True)
     added: list[Right] = []
@@ -505,7 +560,7 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     shared: list[str] = []
     for additions in policies:
         present = before
-        plan = plan_merge(before, additions)
+        plan = plan_merge(before, additions, undenied)
         contradictions += plan.contradictions
         if plan.added:
             document = _Editor(document, path, before).add(plan.entries)

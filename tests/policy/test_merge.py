@@ -6,11 +6,13 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 from shlex import split
+from typing import Any
 
 import pytest
 from hypothesis import given
 
 from sros_tool.errors import UsageError
+from sros_tool.graph.learn import merge_policies
 from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.merge import merge_all, merge_into, merge_notes, plan_merge
 from sros_tool.policy.model import (
@@ -455,6 +457,48 @@ def test_what_one_node_of_an_enclave_denies_to_another_is_told() -> None:
     assert not plan_merge(empty, composed("detector", "light")).contradictions
     again = plan_merge(nodes["detector"], composed("detector", "docker")).contradictions
     assert [note.id for note in merge_notes(again)] == ["merge.still-denied"]
+
+
+NO_CMD = group("topics", "/*cmd_vel /left/y", publish="DENY")
+SENDS = group("topics", "motor cmd_vel y", publish="ALLOW")
+FOLLOWS = group("actions", "follow", execute="ALLOW")
+NO_GOAL = group("services", "/*cmd_vel/_action/send_goal", reply="DENY")
+
+
+@pytest.mark.parametrize(
+    ("before", "asked", "options", "denials"),
+    [
+        (one(), one(NO_CMD, SENDS), {"remaps": ["motor:=/base/cmd_vel"]}, ["newly /*cmd_vel"]),
+        (one(NO_CMD), one(NO_CMD, SENDS), {"remaps": ["motor:=/base/cmd_vel"]},
+         ["still /*cmd_vel"]),
+        (one(), one(NO_CMD, SENDS), {"namespace": "/left"}, ["newly /left/y"]),
+        (one(), one(NO_GOAL, FOLLOWS), {"remaps": ["follow:=/cmd_vel"]},
+         ["newly /*cmd_vel/_action/send_goal"]),
+        # Denied before, too: by its own policy, under the old name, or as an exception.
+        (one(), one(NO_CMD, SENDS), {"remaps": ["cmd_vel:=/base/cmd_vel"]}, []),
+        (one(), one(NO_CMD, SENDS), {"remaps": ["motor:=/base/motor"]}, []),
+        (one(), one(NO_CMD, group("topics", "/*", publish="ALLOW")), {"remaps": ["/cmd_vel:=/x"]},
+         []),
+        (one(NO_CMD), one(NO_CMD, SENDS), {}, []),
+    ],
+)  # fmt: skip
+def test_a_right_that_is_denied_only_under_its_new_name_is_told(
+    before: Policy,
+    asked: Policy,
+    options: dict[str, Any],
+    denials: list[str],
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "a.xml"
+    path.write_bytes(policy_xml(before))
+    enclave = None if "namespace" not in options else "/a"
+    result = merge_policies(path, [asked], **options, enclave=enclave)
+    found = {
+        f"{'newly' if each.new else 'still'} {each.denied.name}" for each in result.contradictions
+    }
+    assert sorted(found) == denials
+    noted = [note.text for note in result.notes if note.id.endswith("-denied")]
+    assert len(noted) == len(denials), noted
 
 
 def test_a_denial_is_told_once_for_all_that_it_meets() -> None:
