@@ -796,7 +796,7 @@ _STATE_WORDS = {
 }
 """State of a file or robot → its words in the output, if they differ from the state's name."""
 _DIGITS = re.compile(r"(\d+)")
-_LONGEST_SUMMARY = 160
+_LONGEST_SUMMARY = 200
 """Maximum number of characters in the last column of the table."""
 _MOST_LINES, _MOST_GROUPS = 50, 3
 """Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
