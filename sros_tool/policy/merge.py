@@ -324,9 +324,9 @@ def kept_rights_notes(
 ) -> Iterator[Note]:
     """Yield a note on rights that nodes keep in ``before``, although ``additions`` lack them.
 
-    Probably an earlier version of the nodes had these rights.  Only nodes count that get a right,
-    and that already have one of the rights of ``additions``.  A policy with only missing rights, as
-    `sros explain --log` prints it, is thus no reason for a note.
+    Another version of the nodes had these rights, or other nodes with the same names.  Only nodes
+    count that get a right, and that already have one of the rights of ``additions``.  A policy with
+    only missing rights, as `sros explain --log` prints it, is thus no reason for a note.
     """
     requested = defaultdict[tuple[str, str], set[Right]](set)
     for addition in additions:
@@ -346,8 +346,10 @@ def kept_rights_notes(
         shown = (f"{right.enclave} {right.describe()}" for right in sorted(kept, key=order))
         text = (
             f"rights stay that the merged policy does not give: {first_few([*shown], _MOST_SHOWN)}."
-            " If only an earlier version of the merged policy gave them, take them out, or merge "
-            "into the policy without this package."
+            " If they are of a later version of the program, keep them. If they are of an earlier "
+            "version that no longer runs, take them out, or merge into the policy without this "
+            "package. If they are of another program with this node name, merge with another "
+            "--namespace, or with --enclave and --remap __node:=NAME."
         )
         yield Note("merge.kept-rights", text)
 

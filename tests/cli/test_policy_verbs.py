@@ -95,11 +95,13 @@ def test_a_merge_notes_an_enclave_that_gets_nodes_of_another_policy(folder: Path
     assert "merge.shared-enclave" not in sros("merge_policy", "a.xml", "package.xml").ok().err
 
 
-def test_a_merge_notes_rights_of_an_earlier_version(folder: Path) -> None:
+def test_a_merge_notes_rights_of_another_version_or_program(folder: Path) -> None:
     for names, kept in ((("y", "x"), True), (("y",), False), (("x", "/cam/*"), False)):
         (folder / "b.xml").write_text(policy_text({"/a": publish(*names), "/b": publish("z")}))
         noted = sros("merge_policy", "a.xml", "b.xml").ok().err
-        assert ("does not give: /a publish topic /cam/*. If only an earlier" in noted) is kept
+        assert ("does not give: /a publish topic /cam/*. If they are of a later" in noted) is kept
+        assert ("no longer runs, take them out" in noted) is kept
+        assert ("another program with this node name, merge with" in noted) is kept
         assert ("merge.kept-rights" in noted) is kept  # a patch has only rights that are missing
 
 
