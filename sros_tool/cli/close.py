@@ -332,12 +332,15 @@ def _remapping_text(closed: CloseState, enclave: str) -> str:
 
 def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:
     """Return the enclave of a process, how sros knows the process, and how it is restarted."""
-    from sros_tool.close.state import units_that_started
+    from sros_tool.close.start_files import only_root_clause
+    from sros_tool.close.state import unit_of_main_process, units_that_started
 
     restart = "by hand, with its launch file" if process.launch else "by hand"
     restart = "by hand, with Docker Compose" if process.container else restart
     if units := [process.unit] if process.unit else units_that_started([process]):
         restart += f", in {enumerated(units)}"
+        if (unit := unit_of_main_process(process)) and only_root_clause([unit]):
+            restart += " (as root, in a folder of root's, --apply restarts it)"
     if not process.is_by_hand:
         is_changed = process.is_idle and not process.secured_by_unit
         restart = f"--apply {'adds a drop-in to' if is_changed else 'restarts'} {process.unit}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
@@ -50,6 +51,7 @@ from sros_tool.runtime.processes import (
     program_of,
     user_text,
 )
+from sros_tool.runtime.unit_properties import unit_properties
 from sros_tool.runtime.variables import STRATEGY
 from sros_tool.values import DryRun, FileChanges, Words, shows
 from sros_tool.wording import first_few
@@ -411,11 +413,28 @@ class RunningRobot:
             and self._programs_of_units[known.unit] == 1
         }
         moved = {known.enclave for known in recognized.values()}
-        stay = [process for process in observed.processes if process.enclave not in moved]
+        stay = [
+            self._with_unit_of_main_process(process)
+            for process in observed.processes
+            if process.enclave not in moved
+        ]
         return observed._replace(
             processes=[*stay, *recognized.values()],
             unknown=[text for text in observed.unknown if text not in recognized],
         )
+
+    def _with_unit_of_main_process(self, known: ClosedProcess) -> ClosedProcess:
+        """Return an open process with the unit into which the user moved it.
+
+        Only root can restart the unit closed; for other users, the process stays without a unit.
+        """
+        unit, pid = unit_of_main_process(known), known.pid
+        is_alone = self._programs_of_units[unit] == 1
+        fits = is_alone and os.access(SYSTEMD_FOLDER, os.W_OK) and self.is_open(known)
+        open_processes = [other for other in self.open_processes if other.program[0] == pid]
+        if unit and fits and any(map(self.may_use_files, open_processes)):
+            return known._replace(unit=unit)
+        return known
 
     def named_processes(
         self, observed: ObservedProcesses, idle: Mapping[str, Collection[str]]
@@ -472,6 +491,15 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
     """Return a process that runs in an enclave, with the command that starts it open."""
     known = ClosedProcess.from_process(process, enclave, process_origin(process.pid), "enclave")
     return known._replace(command=command_without_enclave(known.command, enclave))
+
+
+def unit_of_main_process(process: ClosedProcess) -> str:
+    """Return the unit that now starts a process without a unit, as its main process; or ""."""
+    if process.launch or process.container or process.shares or process.lacks_enclave_argument:
+        return ""
+    unit = process_origin(process.pid).unit if process.pid and not process.unit else ""
+    main = unit_properties(unit, "MainPID").get("MainPID") if unit else ""
+    return unit if main == f"{process.pid}" else ""
 
 
 def units_that_started(processes: Iterable[ClosedProcess]) -> Sequence[str]:

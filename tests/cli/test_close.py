@@ -1126,7 +1126,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     file.write_text(known)
     robot.more = (replace(robot.more[0], pid=12),)
     assert remembered not in robot.close().err, "not in its unit"
-    robot.units["12"] = "own.service"
+    robot.units["12"] = "talker.service"
     assert remembered in robot.close().err, "in a unit of its own"
     del robot.units["12"]
     file.write_text(known)
@@ -1537,6 +1537,33 @@ def test_a_unit_that_was_replaced_is_not_started_again(
         said = robot.close("--apply", status=1).err
         assert "new.service did not run, and --apply starts no stopped unit; to start it" in said
     assert robot.restarts[count:] == []
+
+
+@sometimes("a_process_that_moved_from_a_script_into_a_unit", 1 / 2)
+def test_a_process_that_moved_from_a_script_into_a_unit(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the command that the script had; root restarts it closed."""
+    robot.close()
+    robot.by_hand, robot.units = {"/listener"}, {"/talker": "talker.service"}
+    monkeypatch.setattr(processes, "start_of", lambda pid: f"{boot_id()} {pid} later")
+    line = "/talker: process 4711, known by its command: "
+    by_hand = f"{line}by hand, in talker.service"
+    (robot.folder / "talker.service").write_text("MainPID=5\n")  # the script starts the process
+    assert f"{by_hand}\n" in robot.close().out
+    (robot.folder / "talker.service").write_text("MainPID=4711\n")
+    of_root = robot.folder / "of root"
+    for module in (start_files, state):
+        monkeypatch.setattr(module, "SYSTEMD_FOLDER", of_root)
+    as_root = " (as root, in a folder of root's, --apply restarts it)"
+    assert f"{by_hand}{as_root}\n" in robot.close().out
+    for module in (start_files, state):
+        monkeypatch.setattr(module, "SYSTEMD_FOLDER", robot.folder / "systemd")
+    assert f"{line}--apply restarts talker.service\n" in robot.close().out
+    robot.close("--apply")
+    assert robot.restarts == ["daemon-reload", "restart talker.service"]
+    robot.close("--undo", status=1)
+    assert robot.restarts[2:] == ["daemon-reload", "restart talker.service"]
 
 
 @sometimes("units_that_do_not_restart_are_named", 1 / 2)
