@@ -101,8 +101,10 @@ def prepare(
     """Run the steps whose results are missing, write how each process is started; return the state.
 
     Raises:
-        SrosError: the robot cannot be watched, or the keystore was brought to another machine.
+        SrosError: the robot cannot be watched, the keystore was brought to another machine, or
+            others can change the files that systemd would run.
     """
+    robot.check_units_folder()
     _check_folder(robot)
     if not duration:
         robot.check_rmw()

@@ -168,6 +168,24 @@ class LocalRobot:
                     "Give `sros close` a folder that only you and root can change.",
                 )
 
+    def check_units_folder(self) -> None:
+        """Raise `SrosError` if others, also the user of sudo, can change the drop-ins of units."""
+        trusted = frozenset({0, os.geteuid()})
+        for place, why in replaceable_on_the_way(self.start / "units/UNIT", trusted):
+            remedy = "Choose a folder that only root can change, such as /opt/robot."
+            if self.policy.exists():
+                old, new = shlex.quote(str(self.folder)), "/opt/robot"
+                remedy = (
+                    f"Move '{self.folder}' into a folder that only root can change, such as /opt: "
+                    f"`sudo cp -a {old} {new}`, `sudo chown -R root: {new}`; then run "
+                    f"`sros close {new}` as root, and delete {old}, which has the keys, too."
+                )
+            raise SrosError(
+                f"others can change '{self.folder}'",
+                f"'{place}': {why}. Root would let systemd run what they write there.",
+                remedy,
+            )
+
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Let only one run at a time write into the folder, which is made if it is missing.

@@ -1950,6 +1950,11 @@ def test_what_only_root_can_do_names_the_command_of_root(
     said = robot.close("--apply", status=2, SUDO_UID="1234").err
     assert said.endswith(f": {only}. Nothing was changed. Run {begin}enter){shell}.\n")
     assert not robot.restarts and snapshot(folder) == before and "+ " not in said
+    for words in ((), ("--dry-run",)) if is_root else ():
+        said = robot.close(*words, status=2, SUDO_UID="1234").err
+        assert "others can change 'robot'. " in said and "it belongs to user 1234. Root" in said
+        assert "such as /opt: `sudo cp -a robot /opt/robot`, `sudo chown -R root: /opt" in said
+        assert snapshot(folder) == before and "+ " not in said
     if is_root:
         os.chown(folder, 0, -1)
     monkeypatch.setattr(start_files, "SYSTEMD_FOLDER", robot.folder / "systemd")
