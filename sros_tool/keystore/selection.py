@@ -32,6 +32,7 @@ from sros_tool.keystore.layout import (
     CLOSED_KEYSTORE,
     CLOSED_POLICY,
     FLEET,
+    LEDGER,
     PERMISSIONS_FILE,
     PRIVATE,
     REVOKED,
@@ -395,6 +396,8 @@ def missing_enclave_error(
     except InvalidNameError as error:
         return error
     why = f"The keystore has {first_few(names, _MOST_SHOWN) or 'no enclave'}."
+    if not may_create:
+        return KeystoreError(missing, why, _remedy_to_revoke(keystore, name))
     if robot := folder_of_closed_robot(root):
         folder, policy = quote(str(robot)), quote(str(robot / CLOSED_POLICY))
         if not keystore.is_original and enclave_path(robot / CLOSED_KEYSTORE, name).is_dir():
@@ -425,10 +428,27 @@ def missing_enclave_error(
         return KeystoreError(
             missing, why, f"If the name is right, export the enclave with {where}."
         )
-    if not may_create:
-        return KeystoreError(missing, why, f"See `sros list_enclaves {quote(str(root))}`.")
     create = f"`sros create_enclave {quote(str(root))} {quote(name)}`"
     return KeystoreError(missing, why, f"If the name is right, create the enclave with {create}.")
+
+
+def _remedy_to_revoke(keystore: OpenedKeystore, name: str) -> str:
+    """Return how to revoke the certificates of an enclave that the keystore does not have."""
+    root, enclave = quote(str(keystore.root)), quote(name)
+    see = f"ee `sros list_enclaves {root}`."
+    if not keystore.has(LEDGER):
+        return f"S{see}"
+    try:
+        ledger = keystore.ledger_with("enclave", name)
+    except SrosError:  # not readable
+        return f"S{see}"
+    if any(entry.what == "certificate" and entry.enclave == name for entry in ledger.entries):
+        return (
+            "The ledger has a certificate of the enclave, whose folder was removed. To revoke it, "
+            f"create the enclave again (`sros create_enclave {root} {enclave}`), and run `sros "
+            f"revoke {root} {enclave}`."
+        )
+    return f"The ledger has no certificate of this name, so correct the name: s{see}"
 
 
 _PERMISSION_TEXTS = {

@@ -926,6 +926,8 @@ def test_an_enclave_that_was_removed_without_a_revocation(vendor: str, keystore:
     note = f"note [explain.removed-enclaves]: {ENCLAVE} was removed from the keystore, and not "
     assert note in sros(*asked).err
     assert "removed-enclaves" not in sros(*asked, "--at", "2090-01-01").err
+    again = f"create the enclave again (`sros create_enclave {keystore} {ENCLAVE}`), and run `sros"
+    assert again in sros("revoke", keystore, ENCLAVE).err
     sros("create_enclave", keystore, ENCLAVE).ok()
     sros("revoke", keystore, ENCLAVE).ok()
     assert "removed-enclaves" not in sros(*asked).err
