@@ -76,14 +76,14 @@ def note_on_earlier_permissions(
         text = (
             f"the rights in earlier permissions of {names} are not known here: they were signed "
             "from an earlier policy. Whoever kept these permissions and the key has the rights "
-            f"until {max(unknown.values())}. {_remedy_to_end_rights(keystore, unknown)}"
+            f"until {_ends_text(unknown)}. {_remedy_to_end_rights(keystore, unknown)}"
         )
         yield Note("explain.earlier-permissions", text)
     if same:
         names = first_few(sorted(same), _MOST_NAMED)
         text = (
             f"the present files of {names} do not work, but whoever kept earlier files may still "
-            f"do it until {max(same.values())}. {_remedy_to_end_rights(keystore, same)}"
+            f"do it until {_ends_text(same)}. {_remedy_to_end_rights(keystore, same)}"
         )
         yield Note("explain.earlier-permissions", text)
 
@@ -184,7 +184,7 @@ def note_on_revoked_enclaves(
 
 
 def _ends_text(ends: Mapping[str, str]) -> str:
-    """Return when the certificates of enclaves expire: one moment, or, if the days differ, the last
+    """Return when the files of enclaves expire: one moment, or, if the days differ, the last
     ones with their enclaves.
     """
     if len({end[:10] for end in ends.values()}) == 1:

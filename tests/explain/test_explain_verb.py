@@ -992,6 +992,16 @@ def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path)
         assert f"the rights in earlier permissions of {ENCLAVE} are not known here: " in denied.err
         assert "signed from an earlier policy" in denied.err
     assert "earlier-permissions" not in explain(keystore, "--who", "publish", "/other").err
+    settings = keystore / "sros.toml"
+    brief = '[[enclaves]]\nnames = ["/brief"]\nvalidity = "3d"\n'
+    settings.write_text(settings.read_text() + brief)
+    for topic in ("/chatter", "/other"):
+        policy.write_text(policy_text({"/brief": publish(topic)}))
+        sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
+    day = "[0-9-]{10}T[0-9:]{8}Z"
+    dates = rf"has the rights until {day} \({ENCLAVE}\), {day} \(/brief\)\. To end this"
+    assert re.search(dates, explain(keystore, "--who", *asked).err)
+    sros("revoke", keystore, "/brief").ok()
     ledger = keystore / "ledger.jsonl"
     lines = ledger.read_text().splitlines(keepends=True)
     earlier = next(
