@@ -185,9 +185,9 @@ def _command_lines(
         yield from (f"# {advice}",) if advice else ()
         yield from (f"# {text}" for text in unit_advice(processes))
         for process in processes:
-            for rule in denied_remappings.get(process.enclave, ()):
-                rule_text = visible(rule)
-                yield f"# First change the remapping {rule_text}: the policy denies the new name."
+            for rule in map(visible, denied_remappings.get(process.enclave, ())):
+                denied = rule.rpartition(":=")[2]
+                yield f"# First change the remapping {rule}: the policy denies {denied}."
         yield command
 
 

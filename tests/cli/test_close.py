@@ -319,9 +319,7 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     denied = "start command of /listener remaps to a name that the policy denies (words:=chatter)"
     assert f"{denied}: change the remapping, and then restart the process\n" in ended.out
     commands = (robot.folder / "robot/start/commands.txt").read_text()
-    change = (
-        "First change the remapping words:=chatter: the policy denies the new name.\ncd /opt && "
-    )
+    change = "First change the remapping words:=chatter: the policy denies chatter.\ncd /opt && "
     assert f"\n# /listener\n# {change}" in commands and commands.count("First change") == 1
     by_hand = robot.close("--apply", status=1)
     assert f" words:=chatter\n  the {denied}: change the remap" in by_hand.out
