@@ -261,5 +261,10 @@ def _print_restart(
         text += f"; on Zenoh: {shown_names(zenoh.restart) or 'none'}"
     if exported and (published := publish_command(root)):
         text += f"; for robots that fetch, first run {published}"
-    text += "; if processes run from an export, export their enclaves again first" * exported
-    echo(remedy_in_closed_robot(root, text), err=True)
+    export_again = "export their enclaves again"
+    here = remedy_in_closed_robot(root, export_again)
+    if exported and here != export_again:
+        text = f"first {here}; then {text}"
+    elif exported:
+        text += f"; if processes run from an export, {export_again} first"
+    echo(text, err=True)

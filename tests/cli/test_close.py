@@ -1742,7 +1742,8 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     renewal = ("robot/keystore", "/talker", "--new-key", "--revoke-old")
     sros("renew", *renewal, cwd=robot.folder).ok()
     assert "saw when it watched: /talker\n" in robot.close(status=1).out, "only a key is revoked"
-    sros("revoke", "robot/keystore", "/talker", cwd=robot.folder).ok()
+    said = sros("revoke", "robot/keystore", "/talker", cwd=robot.folder).ok().err
+    assert "first run `sros close robot`; then restart the processes of " in said
     assert "saw when it watched" not in robot.close().out, "the user took the enclave out"
 
 
