@@ -1124,7 +1124,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     file.write_text(known)
     robot.more = (replace(robot.more[0], pid=12),)
     assert remembered not in robot.close().err, "not in its unit"
-    robot.units["12"] = "talker.service"
+    robot.units["12"] = "own.service"
     assert remembered in robot.close().err, "in a unit of its own"
     del robot.units["12"]
     file.write_text(known)
