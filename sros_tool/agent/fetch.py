@@ -172,6 +172,7 @@ def fetch_release(
         with transport.connection:
             updater = _updater(state, transport, now)
             target = updater.get_targetinfo(release_target(robot))
+            _refuse_other_publication(state, transport, source)
             number = _release_number(target, source, robot)
             if target is None:
                 return None
@@ -240,6 +241,27 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
     # The current time is passed in; the client would ask the clock of the machine.
     updater._trusted_set.reference_time = now
     return updater
+
+
+def _refuse_other_publication(
+    state: Path, transport: HttpTransport | FolderTransport, source: str
+) -> None:
+    """Raise `FetchError` if the published timestamp has the version that the robot trusts, but not
+    its content.
+
+    The client of TUF then goes on with its own copy, and would see nothing new.
+    """
+    trusted = read_bytes(
+        state / _METADATA / "timestamp.json", "timestamp", max_bytes=_MOST_METADATA
+    )
+    if transport.timestamp not in (b"", trusted):
+        raise FetchError(
+            FetchProblem.ROLLED_BACK,
+            f"the files in {source} {OLDER_THAN_SEEN}, or from another publication",
+            "The published timestamp.json has the version of the one that this robot received "
+            "before, but other content. Nothing was changed.",
+            OLD_COPY,
+        )
 
 
 def _remove_unreadable(state: Path) -> None:

@@ -35,6 +35,15 @@ class _Transport(FetcherInterface):
     """A TUF fetcher that names the file whose size is wrong."""
 
     base: str
+    timestamp = b""
+    """The content of the timestamp that was fetched last."""
+
+    def download_bytes(self, url: str, max_length: int) -> bytes:
+        """Return a file, as the base class does; remember the timestamp."""
+        data = super().download_bytes(url, max_length)
+        if url.endswith("/metadata/timestamp.json"):
+            self.timestamp = data
+        return data
 
     @contextmanager
     def download_file(self, url: str, max_length: int) -> Iterator[IO[bytes]]:

@@ -1454,6 +1454,8 @@ def test_keystore_and_folder_from_one_backup(publisher: Home) -> None:
     for place, backup in zip(places, backups, strict=True):
         shutil.rmtree(place)
         backup.rename(place)
+    publisher.publish()  # the timestamp gets the version that the robot has seen
+    robot.refuses(FetchProblem.ROLLED_BACK)
     publisher.publish(restored=True, new_folder=True)
     robot.gets()
 
