@@ -16,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
 
@@ -244,7 +245,7 @@ def remapped_policies(
             text = f"--remap {rule} renames an action: {renamed_action_text(rule)}"
             notes.append(Note("merge.remapped-action", text))
     result = [policy for policy, _ in remapped]
-    notes += _notes_on_requirements(policies, rules)
+    notes += _notes_on_requirements(policies, rules, file)
     notes += _notes_on_old_names(file, result, moved)
     return result, [*notes, *_notes_on_earlier_names(file, result, moved)]
 
@@ -365,9 +366,9 @@ def _moves_with_node(use: UsedRule, old: str, new: str) -> bool:
 
 
 def _notes_on_requirements(
-    policies: Iterable[Policy], rules: Iterable[Remapping]
+    policies: Iterable[Policy], rules: Iterable[Remapping], file: Policy
 ) -> Iterator[Note]:
-    """Yield notes on names that no node has any more.
+    """Yield notes on names that no node of the policies to merge has any more.
 
     A requirement for such a name would hold, regardless of who may use the new name.  `sros check`
     can remap the names in requirements, but not by a rule for a namespace.
@@ -411,8 +412,16 @@ def _notes_on_requirements(
         text = (
             f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} protect only the old "
             f"name{'s' * (len(gone) > 1)}, unless you check them with the same remapping: `sros "
-            f"check POLICY --requirements FILE {words}`, with --namespace as in the merge."
+            f"check POLICY --requirements FILE {words}`, with --namespace as in the merge. "
+            f"FILE has only the requirements of {_merged_text(policies, remapped)}: check those of "
+            "other packages by a command of their own."
         )
+        if users := _users_of(gone, file):
+            text += (
+                f" In POLICY, {first_few(users, _MOST_SHOWN)} "
+                f"keep{'s' * (len(users) == 1)} an old name: also check the requirements "
+                f"for {'them' if len(users) > 1 else 'it'}, without this --remap."
+            )
         yield Note("merge.requirements-of-old-names", text)
     split = [
         f"{name} ({right})"
@@ -427,6 +436,33 @@ def _notes_on_requirements(
             "names into a copy of the requirements."
         )
         yield Note("merge.requirements-of-split-names", text)
+
+
+def _merged_text(
+    policies: Iterable[Policy], remapped: Iterable[tuple[Policy, Collection[UsedRule]]]
+) -> str:
+    """Return a text for the package whose policies have names that changed."""
+    changed = [policy for policy, (_, uses) in zip(policies, remapped, strict=True) if uses]
+    files = sorted({Path(policy.file).name for policy in changed if policy.file})
+    return "the merged package" + (f" ({enumerated(files)})" if files else "")
+
+
+def _users_of(names: Collection[str], policy: Policy) -> list[str]:
+    """Return the nodes of a policy that have one of the names, or a right to exactly one of them.
+
+    A name that ends with ``/*`` stands for a node.
+    """
+    users = {
+        profile.full_name
+        for enclave in policy.enclaves
+        for profile in enclave.all_profiles()
+        if f"{profile.full_name}/*" in names
+        or any(
+            right.qualifier is not DENY and right.name in names
+            for right in profile_rights(enclave.path, profile)
+        )
+    }
+    return sorted(users)
 
 
 def _notes_on_old_names(

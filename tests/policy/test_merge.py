@@ -315,6 +315,23 @@ def test_a_name_that_only_one_side_remaps_is_noted(rules: str, split: str) -> No
     assert starts == [True] * bool(split)
 
 
+def test_the_note_on_requirements_names_its_package_and_who_keeps_an_old_name() -> None:
+    """With another package's requirements, the options would hide who may use the old name."""
+    own = group("services", "~/switch", reply="ALLOW")
+    lamp = replace(one(own, group("topics", "x", publish="ALLOW"), node="lamp"), file="d/tower.xml")
+    keeps = "In POLICY, /lamp keeps an old name: also check the requirements for it, without"
+    for file, rules, kept in (
+        (one(own, node="lamp"), "lamp:__node:=tower", True),
+        (one(own, node="other"), "lamp:__node:=tower", False),
+        (one(group("topics", "x", subscribe="ALLOW"), node="lamp"), "x:=/y", True),
+        (one(group("topics", "x", subscribe="DENY"), node="lamp"), "x:=/y", False),
+    ):
+        _, notes = remapped_policies([lamp], [rules], file)
+        (text,) = (note.text for note in notes if note.id == OF_REQUIREMENTS)
+        assert "FILE has only the requirements of the merged package (tower.xml): check" in text
+        assert (keeps in text) == kept
+
+
 def test_names_that_are_exchanged_are_denied_as_before() -> None:
     both = one(group("topics", "x", publish="DENY"), group("topics", "y", publish="ALLOW"))
     (exchanged,), _ = remapped_policies([both], ["x:=y", "y:=x"])
