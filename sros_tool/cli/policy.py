@@ -259,11 +259,12 @@ def diff_policy(
     folders of enclaves, keystores, exports, or Zenoh configurations such as router.json5.
     Permissions and Zenoh rules are shown in ROS terms; the signature of permissions is verified if
     the permissions CA is next to them. "!" marks a right of B whose counterpart, such as the
-    subscriber, only A has. If A or B covers only some enclaves, as an export does, only these are
-    compared. If only one side has Zenoh routers, and these have only the rights that every node
-    needs, they do not count as a difference; a note names them. Lines that differ only in the robot
-    of a fleet are shown as one. Two policies are also compared by the protection that they demand,
-    two keystores by their governance.
+    subscriber, only A has, and a name that only B has, if a wildcard that A and B have allows an
+    enclave to send to it, or to serve it. If A or B covers only some enclaves, as an export does,
+    only these are compared. If only one side has Zenoh routers, and these have only the rights that
+    every node needs, they do not count as a difference; a note names them. Lines that differ only
+    in the robot of a fleet are shown as one. Two policies are also compared by the protection that
+    they demand, two keystores by their governance.
 
     The exit status is 1 if A and B differ (notes name differences that are not in the rights),
     or if DDS would refuse A or B.
@@ -410,7 +411,7 @@ def rights_markdown(
             parts.append(bounded_list(map(code, signed), _MOST_LINES, shown_by))
     if unanswered := list(unanswered_lines(difference, second_source.fleet)):
         parts += [
-            "**Rights without a counterpart now**",
+            "**New names that wildcards match, and rights without a counterpart now**",
             bounded_list(map(code, unanswered), _MOST_LINES, shown_by),
         ]
     if difference.governance_differs:
@@ -459,12 +460,20 @@ def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[st
 def unanswered_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iterator[str]:
     """Yield a line for each right that the change leaves without a counterpart.
 
-    Lines that differ only in the robot are merged.
+    A line for each new name that a wildcard of another enclave matches comes first.  Lines that
+    differ only in the robot are merged.
     """
     from sros_tool.fleet.robots import folded_lines
     from sros_tool.policy.rights import lost_counterpart_text
 
     lines = [
+        (
+            right.enclave,
+            f"! {right.enclave} may {right.right} {right.name}, a new name, by a wildcard",
+        )
+        for right in difference.reached
+    ]
+    lines += [
         (right.enclave, f"! {lost_counterpart_text(right)}") for right in difference.unanswered
     ]
     yield from folded_lines(fleet, lines)

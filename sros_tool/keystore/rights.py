@@ -58,6 +58,7 @@ from sros_tool.policy.rights import (
     RightsDifference,
     Rules,
     compare,
+    new_names_in_wildcards,
     policy_rights,
     rights_without_counterpart,
 )
@@ -691,6 +692,10 @@ class PolicyDifference(NamedTuple):
     """Rights of B whose counterpart only A has, such as a right to publish a topic to which no
     enclave of B may subscribe any more.
     """
+    reached: Sequence[Right]
+    """Rights to names that only B has, which wildcards that A and B have give to other enclaves;
+    rights to subscribe are left out.
+    """
     domains: Sequence[DifferentDomains]
     """Enclaves whose ROS domains differ between the sides; only enclaves for which both sides
     state domains.
@@ -721,6 +726,8 @@ class SourcesDifference(NamedTuple):
     """Protection that only one of two policies states, with "-" for the first, "+" for the second.
     """
     unanswered: Sequence[Right]
+    """As in `PolicyDifference`; empty if a source is only for some enclaves."""
+    reached: Sequence[Right] = ()
     """As in `PolicyDifference`; empty if a source is only for some enclaves."""
     domains: Sequence[DifferentDomains] = ()
     """As in `PolicyDifference`."""
@@ -768,11 +775,12 @@ def compare_sources(
     sides = first_source, second_source
     scope = compared_enclaves(*((side.kind, side.scope) for side in sides))
     difference = compare(first_source.rights, second_source.rights, scope)
-    unanswered = (
-        rights_without_counterpart(first_source.rights, second_source.rights, difference)
-        if all(side.scope is None for side in sides)
-        else ()
-    )
+    unanswered: Sequence[Right] = ()
+    reached: Sequence[Right] = ()
+    if all(side.scope is None for side in sides):
+        rights = first_source.rights, second_source.rights
+        unanswered = rights_without_counterpart(*rights, difference)
+        reached = new_names_in_wildcards(*rights, difference)
     protections = _protection_differences(first_source, second_source)
     domains = _domain_differences(first_source, second_source, scope)
     governed = governance and _governance_differs(first_source, second_source)
@@ -787,7 +795,16 @@ def compare_sources(
     if first_source.policy and second_source.policy and not second_source.fleet:
         forms = changed_forms(first_source.policy.enclaves, second_source.policy.enclaves)
     return SourcesDifference(
-        scope, difference, protections, unanswered, domains, enclaves, governed, unclear, [*forms]
+        scope,
+        difference,
+        protections,
+        unanswered,
+        reached,
+        domains,
+        enclaves,
+        governed,
+        unclear,
+        [*forms],
     )
 
 
@@ -953,6 +970,7 @@ def policy_difference(
             for sign, stated in difference.protections
         ],
         difference.unanswered,
+        difference.reached,
         difference.domains,
         [DifferentEnclave(_SIDE_OF_SIGN[sign], enclave) for sign, enclave in difference.enclaves],
         difference.governance_differs,

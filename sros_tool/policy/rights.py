@@ -597,6 +597,42 @@ def rights_without_counterpart(
     return sorted(right for right in asked if (PEER_RIGHT[right.right], right.name) in lost)
 
 
+def new_names_in_wildcards(
+    first_rights: Collection[Right], second_rights: Collection[Right], difference: RightsDifference
+) -> list[Right]:
+    """Return the rights to new names that wildcards of both sides give without a change.
+
+    A name is new if only ``second_rights`` have it without a wildcard.  Rights to subscribe, which
+    influence no other enclave, are left out, as are rights that the enclave also has by name, and
+    names that every node offers.
+    """
+    known = {(right.kind, right.name) for right in first_rights}
+    new = {
+        (right.kind, right.name)
+        for right in difference.only_second
+        if right.qualifier is not DENY
+        and not is_expression(right.name)
+        and not is_of_every_node(right.name)
+    } - known
+    if not new:
+        return []
+    kept = {*first_rights}.intersection(second_rights)
+    wide: dict[tuple[str, str], list[Right]] = defaultdict(list)
+    for right in kept:
+        if right.qualifier is not DENY and right.right != "subscribe" and is_expression(right.name):
+            wide[right.kind, right.name].append(right)
+    wildcards, rules, named = Names.by_key(wide), Rules(second_rights), {*second_rights}
+    reached = {
+        right._replace(name=name)
+        for kind, name in new
+        if kind in wildcards
+        for wildcard in wildcards[kind].covering(name)
+        for right in wide[kind, wildcard]
+        if rules.allow(right.enclave, right.right, name)
+    }
+    return sorted(reached - named)
+
+
 def _allowed_names(rights: Iterable[Right], words: Iterable[str]) -> dict[str, Names]:
     """Map each right in ``words`` to the names for which some enclave has an ALLOW."""
     allowed = split_actions(right for right in rights if right.qualifier is not DENY)

@@ -111,7 +111,8 @@ def test_a_right_without_its_other_side_is_named(tmp_path: Path) -> None:
     lost = "! /b may subscribe /x, but no enclave may publish it any more"
     assert [line for line in renamed.out.splitlines() if line.startswith("!")] == [lost]
     assert renamed.status == 1
-    assert "!" not in sros("diff_policy", "a.xml", "c.xml", cwd=tmp_path).out
+    widened = sros("diff_policy", "a.xml", "c.xml", cwd=tmp_path).out
+    assert "!" not in widened, "the recorder only listens, and the wildcard of /a is new"
     denial = '<topics publish="DENY"><topic>/x</topic></topics>'
     (tmp_path / "d.xml").write_text(policy_text({"/a": publish("/x") + denial, **reader}))
     assert f"\n{lost}\n" in sros("diff_policy", "a.xml", "d.xml", cwd=tmp_path).out
@@ -122,6 +123,27 @@ def test_a_right_without_its_other_side_is_named(tmp_path: Path) -> None:
         )
     lost = "! /b may subscribe /*/state, but no enclave may publish it any more"
     assert f"\n{lost}\n" in sros("diff_policy", "e.xml", "f.xml", cwd=tmp_path).out
+
+
+def test_a_new_name_that_a_wildcard_of_another_enclave_allows_is_named(tmp_path: Path) -> None:
+    """A package renames its motor command, and a winch may publish the new name already."""
+    denial = '<topics publish="DENY"><topic>/winch_stop</topic></topics>'
+    winch = {"/winch": publish("/winch_*") + denial, "/recorder": subscribe("/*")}
+    for topic in ("motor", "winch_speed", "winch_stop"):
+        rights = {"/motor": subscribe(f"/{topic}"), **winch}
+        (tmp_path / f"{topic}.xml").write_text(policy_text(rights))
+    warned = {
+        topic: [
+            line
+            for line in sros("diff_policy", "motor.xml", f"{topic}.xml", cwd=tmp_path).out.split(
+                "\n"
+            )
+            if line.startswith("!")
+        ]
+        for topic in ("winch_speed", "winch_stop")
+    }
+    line = "! /winch may publish /winch_speed, a new name, by a wildcard"
+    assert warned == {"winch_speed": [line], "winch_stop": []}
 
 
 def test_a_right_that_loses_its_last_user_is_named(tmp_path: Path) -> None:
