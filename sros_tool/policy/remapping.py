@@ -28,6 +28,7 @@ from sros_tool.policy.rights import (
     NodeName,
     Right,
     Rules,
+    is_of_every_node,
     node_of,
     placed_rights,
     policy_rights,
@@ -40,6 +41,7 @@ _NODE_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NODE, _NAMESPACE = "__node", "__ns"
 _EMPTY_POLICY = Policy(())
 _MOST_SHOWN = 3
+_MOST_OWN_NAMES = 8
 
 
 class Remapping(NamedTuple):
@@ -287,11 +289,20 @@ def _unused_rule_error(
             f"Remap each name: `{' '.join(options)}`.",
         )
     renamed = {(u.kind, u.old) for each in policies for u in remapped_policy(each, rules)[1]}
-    if similar := _similar_names(rule, policies, file, renamed):
+    from difflib import get_close_matches  # imported only for this error
+
+    nodes = sorted({profile.node for profile in _profiles(policies)})
+    if rule.node and rule.node not in nodes:
+        similar, own = get_close_matches(rule.node, nodes, _MOST_SHOWN), nodes
+    else:
+        known = {*((right.kind, right.name) for right in policy_rights(file)), *renamed}
+        similar = _similar_names(rule, policies, file, known)
+        own = _own_names(rule, policies, file, known)
+    if similar:
         names = " or ".join(similar)
         reason = f"Perhaps the right name is {names}, for example after an update of a package."
     else:
-        names = ", ".join(_similar_names(rule, policies, file, renamed, at_least=0)) or "no names"
+        names = first_few(own, _MOST_OWN_NAMES) or "no names"
         reason = f"They have {names}. Perhaps an update of a package changed the name."
     return UsageError(
         f"--remap {rule} matches no name or node in the policies to merge",
@@ -319,44 +330,64 @@ def _with_node(name: str, rule: Remapping) -> str:
     return f"/{name}".replace(f"/{rule.node}/", f"/{rule.new}/", 1)[1:]
 
 
+def _profiles(policies: Iterable[Policy]) -> list[Profile]:
+    return [p for policy in policies for enclave in policy.enclaves for p in enclave.all_profiles()]
+
+
+def _kinds_of_new_name(rule: Remapping, file: Policy) -> set[str]:
+    """Return the kinds that the new name of a rule has in ``file``, the policy to merge into."""
+    end = f"/{rule.new.strip('/')}/"
+    return {right.kind for right in policy_rights(file) if f"{right.name}/".endswith(end)}
+
+
+def _names_meant(rule: Remapping, policies: Iterable[Policy]) -> Iterator[tuple[str, str, str]]:
+    """Yield the kind, the name as written and the full name of all names that a rule may mean."""
+    for profile in _profiles(policies):
+        for group in profile.groups if rule.node in ("", profile.node) else ():
+            for name in group.names:
+                if not is_expression(name):
+                    yield group.kind, name, expand(name, profile.ns, profile.node)
+
+
 def _similar_names(
     rule: Remapping,
     policies: Iterable[Policy],
     file: Policy,
-    renamed: Collection[tuple[str, str]],
-    at_least: float = 0.6,
+    known: Collection[tuple[str, str]],
 ) -> list[str]:
     """Return the names in policies that are most similar to the old name of a rule.
 
     First are names of the kind that the new name has in ``file``, the policy to merge into, then
-    names that ``file`` does not have, and that are not ``renamed`` by another rule.  If no node has
-    the rule's node, the result is names of nodes.  ``at_least`` is the lowest similarity of a
-    returned name, from 0 to 1.
+    names that are not ``known``: those in ``file``, and those that another rule renames.
     """
     from difflib import get_close_matches  # imported only for this error
 
-    profiles = [
-        profile
-        for policy in policies
-        for enclave in policy.enclaves
-        for profile in enclave.all_profiles()
-    ]
-    nodes = {profile.node for profile in profiles}
-    if rule.node and rule.node not in nodes:
-        return get_close_matches(rule.node, nodes, _MOST_SHOWN, at_least)
-    present = {(right.kind, right.name) for right in policy_rights(file)}
-    known = {*present, *renamed}
-    kinds = {kind for kind, name in present if f"{name}/".endswith(f"/{rule.new.strip('/')}/")}
+    kinds = _kinds_of_new_name(rule, file)
     ranks: dict[str, tuple[bool, bool]] = {}
-    for profile in profiles:
-        for group in profile.groups if rule.node in ("", profile.node) else ():
-            for name in group.names:
-                if not is_expression(name):
-                    full = expand(name, profile.ns, profile.node)
-                    rank = (group.kind not in kinds, (group.kind, full) in known)
-                    ranks[name] = min(rank, ranks.get(name, rank))
-    similar = get_close_matches(rule.old, ranks, len(ranks) or 1, at_least)
+    for kind, name, full in _names_meant(rule, policies):
+        rank = (kind not in kinds, (kind, full) in known)
+        ranks[name] = min(rank, ranks.get(name, rank))
+    similar = get_close_matches(rule.old, ranks, len(ranks) or 1)
     return sorted(similar, key=ranks.__getitem__)[:_MOST_SHOWN]
+
+
+def _own_names(
+    rule: Remapping,
+    policies: Iterable[Policy],
+    file: Policy,
+    known: Collection[tuple[str, str]],
+) -> list[str]:
+    """Return the names in policies that the old name of a rule may be now, each with its kind.
+
+    Names that every node has are left out.  If the kind of the new name is known from ``file``,
+    and there are names of this kind, so are names of other kinds.  Last are names that are
+    ``known`` (see `_similar_names`).
+    """
+    kinds = _kinds_of_new_name(rule, file)
+    names = [name for name in _names_meant(rule, policies) if not is_of_every_node(name[2])]
+    names = [name for name in names if name[0] in kinds] or names
+    names.sort(key=lambda name: (name[0], name[2]) in known)
+    return list(dict.fromkeys(f"{kind.removesuffix('s')} {name}" for kind, name, _ in names))
 
 
 def _moves_with_node(use: UsedRule, old: str, new: str) -> bool:

@@ -202,8 +202,8 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
         ),
         (("tate:=/s",), "Perhaps the right name is state, for"),  # `state` became longer
         (("cm:image:=/i",), "Perhaps the right name is cam, for"),
-        (("xyz:=/i",), "merge. They have state, /image. Perhaps an update of a package changed"),
-        (("xyz:image:=/i",), "merge. They have n, cam. Perhaps an update of a package changed"),
+        (("xyz:=/i",), "They have topic /image, topic state. Perhaps an update of a package"),
+        (("xyz:image:=/i",), "merge. They have cam, n. Perhaps an update of a package changed"),
         (
             ("cam:__node:=eye", "--remap", "cam:image:=/i"),
             "The rule cam:__node:=eye applies first. Write the node and the name as they are after "
@@ -221,7 +221,11 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
     ended = sros("merge_policy", "robot.xml", "cam.xml", "--remap", "withd:=gap", cwd=folder)
     assert "Perhaps the right name is widths, for" in ended.err
     ended = sros("merge_policy", "robot.xml", "cam.xml", "--remap", "xyz:=gap", cwd=folder)
-    assert "They have opening, width_at_home, widths. Perhaps" in ended.err
+    assert "They have topic opening, topic width_at_home. Perhaps" in ended.err
+    basics = may("reply", "~/set_parameters", "~/get_parameters") + publish("/rosout")
+    (folder / "cam.xml").write_text(changed.replace("</profile>", f"{basics}</profile>"))
+    ended = sros(*words, "motor:=/base/motor", cwd=folder)
+    assert "have topic width_at_home, topic opening, service widths. Perhaps" in ended.err
     panel = policy_text({"/panel": publish("eye/lid", "/front/eye/park", "eyes/lid")})
     (folder / "cam.xml").write_text(panel)
     ended = sros(*words, "eye:__node:=left_eye", cwd=folder)
