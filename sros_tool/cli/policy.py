@@ -662,7 +662,10 @@ def minimize_policy(
         echo(f"would {'replace' if output.exists() else 'write'} {output}", err=as_json)
     if saved:
         echo(saved, err=True)
-    return int(fail_on == "difference" and not minimized.is_as_observed)
+    if fail_on == "never" or minimized.is_as_observed:
+        return 0
+    echo(f"different: {as_written('; '.join(minimized.differences))}", err=True)
+    return 1
 
 
 def _ratio_text(ratio: float | None) -> str:

@@ -624,6 +624,7 @@ def test_nodes_of_one_process_count_for_their_own_enclaves_in_the_policy(folder:
         assert as_data["is_as_observed"] is not bool(status)
         assert "not allowed" not in ended.out and "never observed;" not in ended.out
         assert ended.err.count("[") == bool(said), ended.err
+        assert ("different: nodes of one process" in ended.err) == bool(status)
         view = sros("view", "robot.xml", "--observed", "seen.xml", "--json").ok()
         assert {edge["mark"] for edge in json.loads(view.out)["edges"]} == {"both"}, seen
 
@@ -636,18 +637,25 @@ def test_a_job_fails_where_the_policy_and_what_was_observed_differ(folder: Path)
     words = step[1].replace("/tmp/", "").split()
     (folder / "user.xml").write_text(policy_text({"/left/n": publish("/x", "/y/*")}))
     same = publish("/x", "/y/*")
-    for seen, status, said in (
-        ({"/left/n": same}, 0, "/left/n: allowed"),
-        ({"/left/n": publish("/y/*")}, 1, "never observed, and removed"),
-        ({"/left/n": publish("/x", "/y/a")}, 1, "wider than used"),
-        ({"/left/n": publish("/x", "/y/*", "/cmd_vel")}, 1, "observed, and not allowed"),
-        ({"/right/n": same}, 1, "never observed; not changed"),
-        ({"/left/n": same, "/client": same}, 1, "the policy lacks them: /client."),
+    rights = "the rights of /left/n"
+    unseen = "enclaves that were never observed (note minimize.enclave-never-observed)"
+    lacking = "enclaves that the policy lacks (note minimize.enclave-not-in-policy)"
+    for seen, differences, said in (
+        ({"/left/n": same}, "", "/left/n: allowed"),
+        ({"/left/n": publish("/y/*")}, rights, "never observed, and removed"),
+        ({"/left/n": publish("/x", "/y/a")}, rights, "wider than used"),
+        ({"/left/n": publish("/x", "/y/*", "/cmd_vel")}, rights, "observed, and not allowed"),
+        ({"/right/n": same}, f"{unseen}; {lacking}", "never observed; not changed"),
+        ({"/left/n": same, "/client": same}, lacking, "the policy lacks them: /client."),
+        ({"/left/n": publish("/x"), "/client": same}, f"{rights}; {lacking}", "and removed"),
     ):
         (folder / "learned.xml").write_text(policy_text(seen))
         ended = sros(*words)
+        status = int(bool(differences))
         assert (ended.status, said in ended.out + ended.err) == (status, True), seen
-        sros(*words[:-2]).ok()
+        last = ended.err.splitlines()[-1:]
+        assert not differences or last == [f"different: {differences}"]
+        assert "different: " not in sros(*words[:-2]).ok().err
 
 
 @pytest.mark.parametrize("ns", ["", "/sub"])

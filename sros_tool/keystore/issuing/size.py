@@ -139,6 +139,8 @@ class Minimization(NamedTuple):
     notes: Sequence[Note]
     is_as_observed: bool
     """Whether the policy and the observations have the same enclaves, robots and rights."""
+    differences: Sequence[str] = ()
+    """What differs, as clauses; empty if `is_as_observed`."""
 
 
 def minimized_policy(
@@ -190,8 +192,29 @@ def minimized_policy(
     narrowed = with_names_as_written(result.policy)
     document = checked_text(narrowed, output, "narrowed", placeholders=fleet is not None)
     enclaves = _measured_enclaves(stated, result, observed_rights, fleet)
-    is_as_observed = not gaps and all(use.is_as_observed for use in result.uses)
-    return Minimization(document, enclaves, [*notes, *gaps], is_as_observed)
+    differences = [*_differences(result, gaps)]
+    return Minimization(document, enclaves, [*notes, *gaps], not differences, differences)
+
+
+_DIFFERENCES = {
+    "minimize.divided-process": "nodes of one process that the policy has in several enclaves",
+    "minimize.enclave-never-observed": "enclaves that were never observed",
+    "minimize.enclave-not-in-policy": "enclaves that the policy lacks",
+    "minimize.node-differs": "the rights of a node",
+    "minimize.node-never-observed": "a node that was never observed",
+    "minimize.observed-denial": "a DENY of an observed file",
+    "minimize.robot-never-observed": "an enclave that was not observed for every robot",
+}
+"""What differs, for each note on a difference."""
+
+
+def _differences(result: MinimizedPolicy, gaps: Iterable[Note]) -> Iterator[str]:
+    """Yield what differs, as clauses; ``gaps`` are notes on differences."""
+    changed = [use.enclave for use in result.uses if use.observed_at_all and use.differing()]
+    if changed:
+        yield f"the rights of {first_few(changed, _MOST_SHOWN)}"
+    for id_ in dict.fromkeys(note.id for note in gaps):
+        yield f"{_DIFFERENCES[id_]} (note {id_})"
 
 
 def _note_on_moved(path: str, homes: Mapping[str, str]) -> Note:
