@@ -863,19 +863,11 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     elif any(robot.state == "later" for robot in status.robots):
         text = "the keystore may be older than its robots: if it was restored, publish with"
         yield f"{text} {restored}"
-    elif publication and publication.lacks:
-        decide = (
-            ", which puts it right or prints the remedy"
-            if publication.lacks.startswith("metadata/")
-            else ""
-        )
-        yield f"'{folder}' lacks {publication.lacks}, which robots fetch: run `{publish}`{decide}"
-    elif publication and publication.refused:
-        why = publication.refused
-        yield (
-            f"the published files do not verify: {why}. Run `{publish}`, which puts them right, or "
-            "prints the remedy"
-        )
+    elif publication and (publication.lacks or publication.refused):
+        lacks = f"'{folder}' lacks {publication.lacks}, which robots fetch"
+        wrong = f"the published files do not verify: {publication.refused}"
+        found = "; ".join([lacks] * bool(publication.lacks) + [wrong] * bool(publication.refused))
+        yield f"{found}. Run `{publish}`, which puts this right, or prints the remedy"
     elif publication and publication.accepted is False and publication.expires:
         ago = elapsed(compared_fleet.at - publication.expires)
         yield f"the published files expired {ago} ago, so robots get no new files: run `{publish}`"

@@ -1079,9 +1079,11 @@ class _KeystoreRecords:
         published = read_published(keystore)
         missing = published.first_missing()
         unseen, refused = unseen_clause(missing), publication_problem(keystore)
-        if not (unseen or refused) and (altered := published.first_altered()):
-            refused = f"'{published.folder}' has an archive that is changed or cannot be read: "
-            refused += altered
+        if not unseen and (altered := published.first_altered()):
+            why = (
+                f"'{published.folder}' has an archive that is changed or cannot be read: {altered}"
+            )
+            refused = f"{refused}; {why}" if refused else why
         self._published = published.robots
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
         """Maps robots to the number of the release that was published last for them."""

@@ -1424,8 +1424,15 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
         assert f"{clause}: targets" in sros(*status, cwd=home.folder).out
     (pub / archive).unlink()
     ended = sros(*status, cwd=home.folder)
-    assert f"'{pub}' lacks {archive}, which robots fetch: run {command}\n" in ended.out
+    lacks = f"'{pub}' lacks {archive}, which robots fetch"
+    assert f"{lacks}. Run {command}, which puts this right, or" in ended.out
     assert ended.status == 1
+    other = next(path for path in pub.glob("targets/robots/*.tar.gz") if ".r1." in path.name)
+    kept = other.read_bytes()
+    other.write_bytes(b"altered")
+    both = f"{lacks}; the published files do not verify: '{pub}' {clause}: "
+    assert both in sros(*status, cwd=home.folder).out
+    other.write_bytes(kept)
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", pub, cwd=home.folder)
     assert ended.status == 1 and f"archives in '{pub}' were missing or changed: r2." in ended.err
     for fail_on, exit_status in (("delivery", 1), ("unmended", 0)):
@@ -1438,7 +1445,8 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
         shutil.rmtree(part, ignore_errors=True)
     found = sros(*status, cwd=home.folder).out
     assert (
-        f"metadata/timestamp.json, which robots fetch: run {command}, which puts it right" in found
+        f"metadata/timestamp.json, which robots fetch. Run {command}, which puts this right, or"
+        in found
     )
     refused = sros(*publish, cwd=home.folder)
     assert (
