@@ -6,6 +6,7 @@ import json
 import os
 import shlex
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from itertools import chain
@@ -57,7 +58,7 @@ from sros_tool.keystore.expiry import renewal_command, survey
 from sros_tool.keystore.layout import KEY_FILES, enclave_path, list_enclaves
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.proof.requirements import Must, read_requirements
-from sros_tool.runtime.processes import Process, RunningProcesses
+from sros_tool.runtime.processes import Process, RunningProcesses, user_text
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.validity import iso
 from sros_tool.wording import counted, enumerated, first_few
@@ -388,7 +389,7 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
             "of Fast DDS with them: look at what each process receives now, and restart a process "
             "that receives nothing",
         )
-    elif connections.compared and (text := _unexamined_text(running.processes)):
+    elif connections.compared and (text := _unexamined_text(running.processes, own)):
         yield Proof(CONNECTED, None, text, unexamined=True)
     elif len(connections.compared) > 1:
         number = counted(len(connections.compared), "process", "processes")
@@ -399,13 +400,31 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
         yield Proof(CONNECTED, True, reason)
 
 
-def _unexamined_text(running: RunningProcesses) -> str:
+_SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - only the owners of its files are read
+"""The folder of Fast DDS's shared memory."""
+
+
+def _other_users_of_fastdds(processes: Iterable[Process]) -> list[str]:
+    """Return the users who have shared memory of Fast DDS, other than those of ``processes``."""
+    users = set[int]()
+    with suppress(OSError), os.scandir(_SHARED_MEMORY) as entries:
+        for entry in entries:
+            if entry.name.startswith("fastrtps_"):
+                with suppress(OSError):  # it was removed meanwhile
+                    users.add(entry.stat(follow_symlinks=False).st_uid)
+    return [user_text(user) for user in sorted(users.difference(e.user for e in processes))]
+
+
+def _unexamined_text(running: RunningProcesses, own: Iterable[Process]) -> str:
     """Return text on the processes that may be deaf and cannot be examined; "" without any.
 
-    Those that may not use ROS 2 are left out.
+    If their commands do not show ROS 2, the shared memory of other users than those of the robot's
+    ``own`` processes shows it.
     """
     unseen = [process.label for process in running.unseen if process.uses_ros]
     names = [first_few(unseen, MOST_NAMES)] * bool(unseen)
+    if running.unseen and not unseen and (users := _other_users_of_fastdds(own)):
+        names = [f"processes of {enumerated(users)} with shared memory of Fast DDS"]
     names += ["processes that /proc hides"] * bool(running.hidden)
     if not names:
         return ""

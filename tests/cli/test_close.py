@@ -220,6 +220,7 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(of_robot, "built_without_security", lambda *_: lacking.exists())
     for module in (apply, processes, start_files, state):
         monkeypatch.setattr(module, "SYSTEMD_FOLDER", tmp_path / "systemd")
+    monkeypatch.setattr(proof, "_SHARED_MEMORY", tmp_path / "shm")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
     monkeypatch.setattr(apply, "_STABLE_FOR", timedelta())
     monkeypatch.setattr(apply, "_SECONDS_BETWEEN", 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -223,13 +224,16 @@ def test_processes_that_have_not_connected_fail_the_proof(
     not_here: tuple[str, ...],
     holds: bool | None,
     says: str | None,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where sros sees no connections, it proves nothing, and `close` says so.
 
     A process of a user who cannot read the files only claims to run in an enclave, so it makes the
-    proof neither hold nor fail.
+    proof neither hold nor fail.  Shared memory of another user shows an unexamined process of
+    Fast DDS.
     """
+    monkeypatch.setattr(proof, "_SHARED_MEMORY", tmp_path)
     in_domain = [
         replace(process, enclave=ProcessEnclave(f"/export{process.pid}", "/node"))
         for process in processes
@@ -267,6 +271,15 @@ def test_processes_that_have_not_connected_fail_the_proof(
         is_unseen = said.holds is None
         assert said.acceptances[-1:] == [Acceptance.CONNECTIONS] * is_unseen
         assert (Acceptance.UNEXAMINED in said.acceptances) is ("not be examined" in said.reason)
+    if UNKNOWN in {process.pid for process in processes}:
+        (tmp_path / "fastrtps_port7410").touch()
+        running.secured = [
+            (replace(process, user=os.geteuid() + 1), enclave)
+            for process, enclave in running.secured
+        ]
+        (said,) = _proof_of_connections(closed)
+        text = f"processes of user {os.geteuid()} with shared memory of Fast DDS hear the others"
+        assert (said.holds, text in said.reason) == (None, True)
 
 
 def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command() -> None:
