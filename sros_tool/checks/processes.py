@@ -18,6 +18,7 @@ from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from sros_tool.checks.connections import (
+    CONNECTING_TIME,
     connection_findings,
     connections_between,
     lost_memory_findings,
@@ -760,6 +761,20 @@ def security_counts_text(running: RunningProcesses) -> str:
     numbers = [f"{names[folder]} ({number})" for folder, number in folders.most_common()]
     whence = f"; secured from {enumerated(numbers)}" if len(numbers) > 1 else ""
     return f"processes that use ROS 2, DDS or Zenoh: {', '.join(texts)}{unseen}{whence}"
+
+
+def unjudged_connections_text(running: RunningProcesses, now: datetime) -> str:
+    """Return a clause on secured processes that may still be connecting; "" without any.
+
+    These are processes with shared memory of Fast DDS, whose connections sros can see later.
+    """
+    connecting = [node for node in running.processes if node.own_ports and node.asks_for_security]
+    judged = {node.pid for node in with_time_to_connect(connecting, now)}
+    if young := [node for node in connecting if node.pid not in judged]:
+        number = counted(len(young), "process", "processes")
+        seconds = CONNECTING_TIME.seconds
+        return f"connections of {number} are not judged yet: started less than {seconds} s ago"
+    return ""
 
 
 def process_findings(

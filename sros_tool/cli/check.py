@@ -731,7 +731,7 @@ def _machine_findings(
     None means the advisories that ship with sros.  With ``says_counts``, a line says how many
     processes run secured and open.
     """
-    from sros_tool.checks.processes import security_counts_text
+    from sros_tool.checks.processes import security_counts_text, unjudged_connections_text
     from sros_tool.checks.runtime import RuntimeState, runtime_findings
     from sros_tool.cli.common import local_zone
     from sros_tool.runtime.processes import ProcessTable
@@ -745,6 +745,8 @@ def _machine_findings(
     )
     if says_counts and (counts := security_counts_text(running)):
         echo(counts, err=True)
+        if unjudged := unjudged_connections_text(running, clock):
+            echo(unjudged, err=True)
     return runtime_findings(state)
 
 

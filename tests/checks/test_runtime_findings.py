@@ -17,7 +17,11 @@ import pytest
 from sros_tool.checks import processes, runtime
 from sros_tool.checks.environment import security_clauses
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingFilter
-from sros_tool.checks.processes import may_lack_list, security_counts_text
+from sros_tool.checks.processes import (
+    may_lack_list,
+    security_counts_text,
+    unjudged_connections_text,
+)
 from sros_tool.checks.runtime import RuntimeState
 from sros_tool.keystore.layout import CERTIFICATE_FILE, CRL_FILE
 from sros_tool.runtime.processes import (
@@ -166,6 +170,18 @@ def test_found(expected: str, sound_one: RuntimeState, bench: Bench) -> None:
             os.utime(path, (begin, begin))
         assert expected not in ids(sound_one)
     assert expected in ids(CASES[expected](state, bench))
+
+
+def test_processes_that_may_still_connect_are_counted(
+    sound_one: RuntimeState, bench: Bench
+) -> None:
+    """The absence of the finding on their connections proves nothing yet."""
+    state = CASES["runtime.process-not-connected"](sound_one, bench)
+    nodes = [*state.running.processes]
+    for seconds, text in ((29, "connections of 2 processes are not judged yet"), (30, "")):
+        young = [replace(node, started=state.now - timedelta(seconds=seconds)) for node in nodes]
+        said = unjudged_connections_text(RunningProcesses(tuple(young)), state.now)
+        assert said.startswith(text) and bool(said) is bool(text)
 
 
 def test_the_same_files_in_another_folder_are_no_other_files(
