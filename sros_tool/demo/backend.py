@@ -61,6 +61,14 @@ _WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 
 Packets in shared memory cannot be captured, and do not pass between processes of different users.
 """
+_MORE_PARTICIPANTS = {
+    "CYCLONEDDS_URI": "<CycloneDDS><Domain><Discovery><MaxAutoParticipantIndex>100"
+    "</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>"
+}
+"""Environment variable with which Cyclone DDS joins a domain with ten participants and more.
+
+Without multicast, its default allows ten on each host.
+"""
 
 
 @cache
@@ -456,7 +464,7 @@ def run_by_hand(
         stopped.set()
         end_within(0 if again else _SECONDS_TO_STOP, process)
 
-    environment = {**_WITHOUT_SHARED_MEMORY, **os.environ}
+    environment = {**_WITHOUT_SHARED_MEMORY, **_MORE_PARTICIPANTS, **os.environ}
     with subprocess.Popen(
         command, pass_fds=[writing], preexec_fn=end_with_starter(), env=environment
     ) as process:
