@@ -36,8 +36,8 @@ PROCESS_NOT_CONNECTED = FindingKind(
     "Fast DDS 2.6 to 3.6 (SecurityManager.cpp); tested with 2.14.5.",
     "If another finding names one of these processes, first do what that finding says. "
     "Otherwise, restart the process that this finding names. If this does not help, the program "
-    "may turn security off in its own environment (such as `os.environ` in Python): `sros close "
-    "--proof` sees a node that runs open.",
+    "may turn security off in its own environment (such as `os.environ` in Python): the proof of "
+    "a closed robot (docs/close.md, The proof) sees a node that runs open.",
     vendors=FAST_DDS,
 )
 PROCESS_LOST_MEMORY = FindingKind(
