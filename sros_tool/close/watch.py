@@ -97,12 +97,14 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     with _recorded_processes(robot) as started:
         status, document, _ = robot.shell.run(words, True)
     running = RunningRobot(robot)
+    enclaves = [process.enclave for process in running.in_domain if process.enclave]
+    closed = [
+        f"Processes run with the files of '{files}': if that is the robot, name its folder, not "
+        f"'{robot.folder}'"
+        for files in sorted({*map(keystore_text, enclaves)})[:1]
+    ]
     if status:
-        others = running.other_domains_text()
-        enclaves = [process.enclave for process in running.in_domain if process.enclave]
-        for files in sorted({*map(keystore_text, enclaves)})[:1]:
-            others += ". " * bool(others) + f"Processes run with the files of '{files}': if that "
-            others += f"is the robot, name its folder, not '{robot.folder}'"
+        others = ". ".join(filter(None, (running.other_domains_text(), *closed)))
         raise UnavailableError(
             f"there is no robot to close: no node was observed in domain {robot.domain}",
             f"{others}." if others else "",
@@ -131,6 +133,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
         remove_file(robot.observed_policy)
     without_enclave = [node.fqn for node in robot_nodes(all_nodes) if not node.enclaves]
     problems = [_text_on_nodes_without_enclave(robot, without_enclave)] if without_enclave else []
+    problems += closed if not robot.keystore.exists() else []
     lacking = ""
     if learned["dry_run"]:
         lacking = _lacking_text(robot, nodes, observed_nodes.renamed_nodes)

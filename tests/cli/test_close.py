@@ -2034,7 +2034,11 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     assert "has no watched robot" in robot.close("--proof", status=2).err
     assert "no node was observed in domain 0. Start the robot open" in robot.close(status=2).err
     assert (robot.folder / "robot").exists()
-    robot.nodes = (TALKER, LISTENER)
+    robot.nodes, robot.more = (TALKER, LISTENER), (closed,)
+    assert there in robot.close(status=1).out
+    shutil.rmtree(robot.folder / "robot")
+    (robot.folder / "robot").mkdir()
+    robot.more = ()
     robot.close()
     assert "was watched in domain 0, not 7" in robot.close("--domain", "7", status=2).err
     file = robot.folder / "robot/processes.json"
