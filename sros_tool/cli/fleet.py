@@ -866,8 +866,8 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     elif publication and (publication.lacks or publication.refused):
         lacks = f"'{folder}' lacks {publication.lacks}, which robots fetch"
         wrong = f"the published files do not verify: {publication.refused}"
-        found = "; ".join([lacks] * bool(publication.lacks) + [wrong] * bool(publication.refused))
-        yield f"{found}. Run `{publish}`, which puts this right, or prints the remedy"
+        faults = [lacks] * bool(publication.lacks) + [wrong] * bool(publication.refused)
+        yield f"{'; '.join(faults)}. Run `{publish}`, which puts this right, or prints the remedy"
     elif publication and publication.accepted is False and publication.expires:
         ago = elapsed(compared_fleet.at - publication.expires)
         yield f"the published files expired {ago} ago, so robots get no new files: run `{publish}`"

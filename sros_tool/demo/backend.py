@@ -31,7 +31,7 @@ from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.parallel import end_with_starter
 from sros_tool.policy.patterns import matches
-from sros_tool.runtime.cyclone import INSTALL_ADVICE, load_cyclone
+from sros_tool.runtime.cyclone import INSTALL_ADVICE, MORE_PARTICIPANTS, load_cyclone
 from sros_tool.runtime.events import Event, EventKind, ProcessStage, parse_event
 from sros_tool.runtime.rmw import (
     RMW,
@@ -60,14 +60,6 @@ _WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Environment variable that keeps Fast DDS from using shared memory.
 
 Packets in shared memory cannot be captured, and do not pass between processes of different users.
-"""
-_MORE_PARTICIPANTS = {
-    "CYCLONEDDS_URI": "<CycloneDDS><Domain><Discovery><MaxAutoParticipantIndex>100"
-    "</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>"
-}
-"""Environment variable with which Cyclone DDS joins a domain with ten participants and more.
-
-Without multicast, its default allows ten on each host.
 """
 
 
@@ -464,7 +456,11 @@ def run_by_hand(
         stopped.set()
         end_within(0 if again else _SECONDS_TO_STOP, process)
 
-    environment = {**_WITHOUT_SHARED_MEMORY, **_MORE_PARTICIPANTS, **os.environ}
+    environment = {
+        **_WITHOUT_SHARED_MEMORY,
+        "CYCLONEDDS_URI": MORE_PARTICIPANTS,
+        **os.environ,
+    }
     with subprocess.Popen(
         command, pass_fds=[writing], preexec_fn=end_with_starter(), env=environment
     ) as process:

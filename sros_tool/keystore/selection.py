@@ -48,7 +48,7 @@ from sros_tool.names import check_enclave_name
 from sros_tool.pki.crl import signed_by
 from sros_tool.validity import iso
 from sros_tool.values import shows
-from sros_tool.wording import first_few
+from sros_tool.wording import capitalized, first_few
 
 
 @shows(optional=("robots",))
@@ -435,20 +435,20 @@ def missing_enclave_error(
 def _remedy_to_revoke(keystore: OpenedKeystore, name: str) -> str:
     """Return how to revoke the certificates of an enclave that the keystore does not have."""
     root, enclave = quote(str(keystore.root)), quote(name)
-    see = f"ee `sros list_enclaves {root}`."
+    see = f"see `sros list_enclaves {root}`."
     if not keystore.has(LEDGER):
-        return f"S{see}"
+        return capitalized(see)
     try:
         ledger = keystore.ledger_with("enclave", name)
     except SrosError:  # not readable
-        return f"S{see}"
+        return capitalized(see)
     if any(entry.what == "certificate" and entry.enclave == name for entry in ledger.entries):
         return (
             "The ledger has a certificate of the enclave, whose folder was removed. To revoke it, "
             f"create the enclave again (`sros create_enclave {root} {enclave}`), and run `sros "
             f"revoke {root} {enclave}`."
         )
-    return f"The ledger has no certificate of this name, so correct the name: s{see}"
+    return f"The ledger has no certificate of this name, so correct the name: {see}"
 
 
 _PERMISSION_TEXTS = {

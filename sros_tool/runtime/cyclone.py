@@ -262,13 +262,22 @@ class Participant:
         )
         if refused:
             return SecurityRefusedError(fault, reason)
-        return DdsError(fault, reason, _MORE_PARTICIPANTS if "participant index" in reason else "")
+        return DdsError(
+            fault, reason, _TOO_MANY_PARTICIPANTS if "participant index" in reason else ""
+        )
 
 
-_MORE_PARTICIPANTS = (
+MORE_PARTICIPANTS = (
+    "<CycloneDDS><Domain><Discovery><MaxAutoParticipantIndex>100</MaxAutoParticipantIndex>"
+    "</Discovery></Domain></CycloneDDS>"
+)
+"""The CYCLONEDDS_URI with which Cyclone DDS joins a domain with ten participants and more.
+
+Without multicast, its default allows ten on each host.
+"""
+_TOO_MANY_PARTICIPANTS = (
     "Without multicast, Cyclone DDS has room for ten participants of a domain on each host. Allow "
-    "more with CYCLONEDDS_URI='<CycloneDDS><Domain><Discovery><MaxAutoParticipantIndex>100"
-    "</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>', or, for "
+    f"more with CYCLONEDDS_URI='{MORE_PARTICIPANTS}', or, for "
     "`sros demo talker` and `listener`, add --backend rclpy."
 )
 

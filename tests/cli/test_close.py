@@ -2036,6 +2036,7 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     assert (robot.folder / "robot").exists()
     robot.nodes, robot.more = (TALKER, LISTENER), (closed,)
     assert there in robot.close(status=1).out
+    assert there not in robot.close(status=1).out, "they may be of another robot"
     shutil.rmtree(robot.folder / "robot")
     (robot.folder / "robot").mkdir()
     robot.more = ()

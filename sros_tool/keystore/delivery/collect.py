@@ -49,8 +49,8 @@ from sros_tool.keystore.delivery.published import may_have_later_releases, read_
 from sros_tool.keystore.delivery.restored import (
     LaterSeals,
     has_unpublished_restore,
-    lost_ca_remedy,
     perhaps_revoked_step,
+    rotation_command,
 )
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
@@ -306,7 +306,7 @@ def collect(
         dry_run,
         [*changes, *signed],
         [
-            *_unknown_file_notes(inbox, fleet, OpenedKeystore(root), is_older=is_older),
+            *_unknown_file_notes(inbox, fleet, after, is_older=is_older),
             *_older_message_notes(inbox, taken),
             *notes,
         ],
@@ -1110,7 +1110,7 @@ def _later_release_notes(
     """Yield a note on robots with releases that the keystore sealed, but does not know any more."""
     if robots:
         have = f"{first_few(robots, _SHOWN)} {'has' if len(robots) == 1 else 'have'}"
-        first = f" after {lost_ca_remedy(keystore)}, and" if has_lost_ca else ""
+        first = f" after {rotation_command(keystore)}, and" if has_lost_ca else ""
         lost = " Its identity CA was replaced after the backup." if has_lost_ca else ""
         yield Note(
             "fleet.later-release",

@@ -732,11 +732,35 @@ def _missing_step(root: str, missing: Sequence[str]) -> str:
     )
 
 
-def lost_ca_remedy(keystore: OpenedKeystore) -> str:
-    """Return the command that replaces an identity CA which was replaced after the backup."""
-    separate = " --identity" if len(keystore.authority_files) > 1 else ""
-    where = quote(str(keystore.root))
-    return f"`sros rotate_ca {where}{separate} --finish --allow-unconfirmed`"
+def rotation_command(keystore: OpenedKeystore, roles: Sequence[str] = (IDENTITY,)) -> str:
+    """Return the command that replaces CAs that were replaced after the backup, in backquotes."""
+    has_own_ca = len(keystore.authority_files) > 1
+    flag = f" --{roles[0]}" if has_own_ca and len(roles) == 1 else ""
+    return f"`sros rotate_ca {quote(str(keystore.root))}{flag} --finish --allow-unconfirmed`"
+
+
+def _replaced_authorities_error(
+    keystore: OpenedKeystore, replaced_roles: Sequence[str], evidence: str
+) -> KeystoreError:
+    """Return the error that CAs were replaced after the backup; ``evidence`` shows it."""
+    roles = replaced_roles if len(keystore.authority_files) > 1 else replaced_roles[:1]
+    names = " and ".join(f"the {role} CA" for role in roles)
+    options = " ".join(f"--{role}-ca FILE --{role}-key PLACE" for role in roles)
+    by_hand = (
+        " Otherwise, also bring each robot its files by hand (`sros distribute_key "
+        f"{quote(str(keystore.root))} --robot NAME FOLDER --force`), because a robot accepts a "
+        "release only if it trusts the CA that sealed the release."
+    ) * (PERMISSIONS in replaced_roles)
+    return KeystoreError(
+        f"{names} {'was' if len(roles) == 1 else 'were'} replaced after the backup of the "
+        f"keystore '{keystore.root}'",
+        f"{evidence} Publishing would put robots back on an earlier CA, whose key somebody may "
+        "have copied.",
+        "Restore a backup from after the rotation. If there is none, repeat later revocations, "
+        f"repeat the rotation ({rotation_command(keystore, roles)}), and repeat this command. If "
+        f"you have the key of each later CA, add {options} to the command of the rotation, so that "
+        f"the keystore uses the later CA again (docs/howto/keystore_is_lost.md).{by_hand}",
+    )
 
 
 def refuse_lost_ca(keystore: OpenedKeystore) -> None:
@@ -752,15 +776,8 @@ def refuse_lost_ca(keystore: OpenedKeystore) -> None:
         elif entry.what == RESTORED and entry.reason == LOST_CA:
             is_lost = True
     if is_lost:
-        raise KeystoreError(
-            f"the identity CA was replaced after the backup of the keystore '{keystore.root}'",
-            "Robots have certificates of a later CA, as their messages show. Publishing would put "
-            "robots back on an earlier CA, whose key somebody may have copied.",
-            "Restore a backup from after the rotation. If there is none, repeat later revocations, "
-            f"repeat the rotation ({lost_ca_remedy(keystore)}), and repeat this command. If you "
-            "have the key of the later CA, add --identity-ca FILE --identity-key PLACE to the "
-            "command of the rotation (docs/howto/keystore_is_lost.md).",
-        )
+        evidence = "Robots have certificates of a later CA, as their messages show."
+        raise _replaced_authorities_error(keystore, (IDENTITY,), evidence)
 
 
 def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> None:
@@ -785,29 +802,9 @@ def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> 
             replaced[role] = newest
     if not replaced:
         return
-    where = quote(str(keystore.root))
-    separate = len(keystore.authority_files) > 1
-    roles = tuple(replaced) if separate else tuple(replaced)[:1]
-    flag = f" --{roles[0]}" if separate and len(roles) == 1 else ""
-    names = " and ".join(f"the {role} CA" for role in roles)
-    later_ones = " and ".join(authority_text(replaced[role]) for role in roles)
-    options = " ".join(f"--{role}-ca FILE --{role}-key PLACE" for role in roles)
-    by_hand = (
-        " Otherwise, also bring each robot its files by hand (`sros distribute_key "
-        f"{where} --robot NAME FOLDER --force`), because a robot accepts a "
-        "release only if it trusts the CA that sealed the release."
-    ) * (PERMISSIONS in replaced)
-    raise KeystoreError(
-        f"{names} {'was' if len(roles) == 1 else 'were'} replaced after the backup of the "
-        f"keystore '{keystore.root}'",
-        f"With the last release in '{folder}', robots trust {later_ones}. Publishing would put "
-        "robots back on an earlier CA, whose key somebody may have copied.",
-        "Restore a backup from after the rotation. If there is none, repeat later "
-        f"revocations, repeat the rotation (`sros rotate_ca {where}{flag} --finish "
-        "--allow-unconfirmed`), and repeat this command. If you have the key of each later "
-        f"CA, add {options} to the command of the rotation, so that the keystore uses the later "
-        f"CA again (docs/howto/keystore_is_lost.md).{by_hand}",
-    )
+    later_ones = " and ".join(dict.fromkeys(map(authority_text, replaced.values())))
+    evidence = f"With the last release in '{folder}', robots trust {later_ones}."
+    raise _replaced_authorities_error(keystore, tuple(replaced), evidence)
 
 
 def other_changes_notes(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> Iterator[Note]:
