@@ -592,6 +592,7 @@ def _zenoh_decision_lines(on_zenoh: ZenohNextToDds | None) -> Iterator[str]:
 def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     """Yield the answer for one vendor as lines; ``why`` is the reason to choose this vendor."""
     from sros_tool.explain.answer import template_default
+    from sros_tool.keystore.template import DEFAULT_TEMPLATE
 
     decision, grant = answer.decision, answer.grant
     name = answer.enclave.name
@@ -629,7 +630,10 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
             else f"a policy file: add --policy FILE to see its line (digest {digest[:12]})",
         )
     if answer.allowed:
-        yield _labeled_row("protected", ", ".join(_protection_words(answer)))
+        protection = ", ".join(_protection_words(answer))
+        if not (answer.enclave.state or answer.enclave.keystore):
+            protection += f", in a keystore with the template {DEFAULT_TEMPLATE}"
+        yield _labeled_row("protected", protection)
     elif answer.denied_by:
         yield _labeled_row("denied by", answer.denied_by)
     if answer.until and answer.allowed:

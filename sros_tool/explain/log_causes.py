@@ -652,9 +652,12 @@ class Examiner:
                     f"{_otherwise(remedy)}"
                 )
             if self._closed_robot().commands:
-                start = "Probably the node lacks a remapping, or has a wrong one: look at "
-                unit = self._closed_robot().units.get(enclave.name)
-                start += f"its command in {unit or _COMMANDS}."
+                place = self._closed_robot().units.get(enclave.name) or _COMMANDS
+                lacks = "the node lacks a remapping, or has a wrong one"
+                # No other node need have a right to a name that only this node brings.
+                if denied.right == "reply" or _is_private(name, _served_names(asked)):
+                    return facts, f"{remedy} Or, if {lacks}, correct its command in {place}."
+                start = f"Probably {lacks}: look at its command in {place}."
             elif not start:
                 start = (
                     "Perhaps a remapping or a parameter is missing or wrong: compare the node's "
@@ -832,6 +835,11 @@ class Examiner:
                 "domain of the keystore", f"domain of the keystore, such as {next(iter(governed))}"
             ),
         )
+
+
+def _is_private(name: str, nodes: Iterable[str]) -> bool:
+    """Return whether a name is a private name (``~/NAME``) of one of the nodes."""
+    return any(name.startswith(f"{node}/") for node in nodes)
 
 
 def _remapping_advice(name: str, meant: str) -> str:

@@ -137,6 +137,12 @@ def test_a_denial_takes_a_right_away(root: Path) -> None:
     )
     ended = sros(*words, cwd=root.parent).ok()
     assert "/robot" in ended.out and "loses" not in ended.err and "work until" not in ended.err
+    (root.parent / "denied.xml").write_text(
+        policy_text({"/robot": publish("/scan", "/secret") + also})
+    )
+    ended = sros(*words, cwd=root.parent).ok()
+    gain = "/robot gains: publish topic /secret (where allowed: a DENY is gone)"
+    assert gain in ended.err
 
 
 # ── templates ──────────────────────────────────────────────────────────────────────────────

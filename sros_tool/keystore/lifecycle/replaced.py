@@ -86,18 +86,16 @@ class ReplacedRights:
 
         Rights to names that differ only in the robot of ``fleet`` share an entry.
         """
-        return self._text(self.lost, self.lost_domains, fleet)
+        return self._text(_described_rights(self.lost), self.lost_domains, fleet)
 
     def gained_text(self, fleet: Fleet | None = None) -> str:
         """Return the gained rights and domains as text, like `lost_text`; "" if there are none."""
-        return self._text(self.gained, self.gained_domains, fleet)
+        return self._text(_described_gains(self.gained), self.gained_domains, fleet)
 
-    def _text(self, rights: Sequence[Right], domains: str, fleet: Fleet | None) -> str:
-        described = folded_lines(
-            fleet, ((self.enclave, text) for text in _described_rights(rights))
-        )
+    def _text(self, described: Sequence[str], domains: str, fleet: Fleet | None) -> str:
+        folded = folded_lines(fleet, ((self.enclave, text) for text in described))
         texts = (
-            first_few(list(described), _RIGHTS_SHOWN),
+            first_few(list(folded), _RIGHTS_SHOWN),
             f"domain {domains}" if domains else "",
         )
         return ", ".join(filter(None, texts))
@@ -295,18 +293,18 @@ _RIGHTS_SHOWN = 6
 _ENCLAVES_SHOWN = 3
 
 
-def rights_text(rights: Sequence[Right]) -> str:
-    """Return lost or gained rights as text, such as ``publish topic /a, call action /b``.
-
-    An added or removed denial is marked with "(by a DENY)".
-    """
-    return first_few(_described_rights(rights), _RIGHTS_SHOWN)
+def gained_rights_text(rights: Sequence[Right]) -> str:
+    """Return gained rights as text, such as ``publish topic /a, call action /b``."""
+    return first_few(_described_gains(rights), _RIGHTS_SHOWN)
 
 
-def _described_rights(rights: Sequence[Right]) -> list[str]:
-    return [
-        right.describe() + ("" if right.qualifier is ALLOW else " (by a DENY)") for right in rights
-    ]
+def _described_gains(rights: Sequence[Right]) -> list[str]:
+    return _described_rights(rights, " (where allowed: a DENY is gone)")
+
+
+def _described_rights(rights: Sequence[Right], of_denial: str = " (by a DENY)") -> list[str]:
+    """Return each right as text, that of an added or removed denial with ``of_denial``."""
+    return [right.describe() + ("" if right.qualifier is ALLOW else of_denial) for right in rights]
 
 
 def old_program_text(replaced_rights: Iterable[ReplacedRights]) -> str:

@@ -65,8 +65,8 @@ from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
     ReplacedRights,
     SupersededCertificate,
+    gained_rights_text,
     replaced_rights,
-    rights_text,
     with_expiries_in_ledger,
 )
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
@@ -126,7 +126,7 @@ class KeystoreUpdate(Changed):
     def looser(self) -> tuple[str, ...]:
         """What the update newly allows, as clauses."""
         gained = [
-            f"{right.enclave} gains {rights_text(right.gained)}"
+            f"{right.enclave} gains {gained_rights_text(right.gained)}"
             for right in self.rights
             if right.gained
         ]
