@@ -316,6 +316,6 @@ CASES: dict[str, Change] = {
     "runtime.known-vulnerabilities": on_fast_dds("/opt/ros/jazzy/lib", "2.14.5"),
     "runtime.package-vulnerabilities": on_fast_dds("/usr/lib/x86_64-linux-gnu", "2.14.5"),
     "runtime.vulnerabilities-unclear": on_fast_dds("/opt/ros/humble/lib", "2.6.12"),
-    "runtime.dds-version-unknown": on_fast_dds("/opt/ros/jazzy/lib", ""),
+    "runtime.dds-version-unknown": on_fast_dds("/opt/robot/lib", ""),
 }
 SOUND: Change = _without_ca_keys
