@@ -697,6 +697,8 @@ class _Reader:
         name = element.text or ""
         sampled = self._example_name(name, element, place, several=True)
         inner = next((child for child in element if isinstance(child.tag, str)), None)
+        if inner is None and not name:
+            self._read_protection(element, place)  # refuses an instruction before the name
         problem = (
             expression_problem(sampled)
             if inner is None

@@ -80,6 +80,8 @@ def test_the_schema_and_readers_of_ros2_are_not_disturbed() -> None:
         with pytest.raises(PolicyError, match="has no attribute") as refused:
             read(changed)
         assert '<topic>scan<?sros protect="encrypt"?></topic>' in refused.value.remedy
+    with pytest.raises(PolicyError, match="directly between the name and its end tag"):
+        read(WRITTEN.replace(f"<topic>scan{ENCRYPT}", f"<topic>{ENCRYPT}scan"))
 
 
 @pytest.mark.parametrize(
