@@ -903,10 +903,11 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"CA rotation: {status.stage}; {confirmed}"
     yield from _revocation_list_facts(compared_fleet)
     yield from _expiry_facts(compared_fleet)
-    if status.unassigned:
+    if status.without_robot:
         whose = counted(status.unassigned, "enclave belongs", "enclaves belong")
         covered = "it" if status.unassigned == 1 else "them"
-        yield f"{whose} to no robot, so no confirmation covers {covered}"
+        named = first_few(status.without_robot, 3)
+        yield f"{whose} to no robot, so no confirmation covers {covered}: {named}"
     if status.left:
         whose = counted(len(status.left), "valid enclave")
         yield (

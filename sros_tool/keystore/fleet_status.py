@@ -570,6 +570,7 @@ class PublishedMetadata:
         "stage",
         "counts",
         "unassigned",
+        "without_robot",
         "left",
         "overdue",
         "older",
@@ -587,9 +588,9 @@ class FleetStatus:
     """Stage of the keystore's CA rotation; ``complete`` if no rotation is in progress."""
     robots: tuple[RobotStatus, ...]
     """The robots, sorted by name."""
-    unassigned: int
-    """Number of enclaves that belong to no robot, so that no confirmation includes them; 0 with
-    ``--robot``.
+    without_robot: tuple[str, ...]
+    """The enclaves that belong to no robot, so that no confirmation includes them, sorted by name;
+    empty with ``--robot``.
     """
     left: tuple[str, ...] = ()
     """The valid enclaves of robots that left the fleet or their group, sorted by name; empty with
@@ -635,6 +636,11 @@ class FleetStatus:
     """The kinds of files that every robot must have before the next stage of a rotation."""
     recorded: datetime | None = None
     """The time of the last entry of the ledger, in UTC; None for an empty ledger."""
+
+    @property
+    def unassigned(self) -> int:
+        """Number of enclaves that belong to no robot; 0 with ``--robot``."""
+        return len(self.without_robot)
 
     @property
     def names(self) -> list[str]:
@@ -777,7 +783,7 @@ def fleet_status(
     stages = _Stages(keystore)
     records = _KeystoreRecords(keystore, fleet, compared, stages)
     existing = keystore.names
-    unassigned = 0 if names else len(existing) - sum(len(robot.enclaves) for robot in compared)
+    of_robots = {enclave for robot in compared for enclave in robot.enclaves}
     unrecorded = unrecorded_enclaves(fleet, existing, {robot.name for robot in robots})
     statuses = tuple(
         _robot_status(robot, records, stages, unrecorded[robot.robot.name], now)
@@ -796,7 +802,7 @@ def fleet_status(
         keystore.root,
         stages.stage_of_keystore,
         statuses,
-        unassigned,
+        () if names else tuple(sorted(set(existing) - of_robots)),
         () if names else tuple(left_enclaves(keystore, fleet, now)),
         older=older,
         edited=fleet_edits_clause(keystore, keystore.ledger_with("what", "fleet")),

@@ -177,7 +177,7 @@ def test_a_fleet_that_has_all_it_should_have(field: Field) -> None:
     assert found["counts"] == {"current": 3}
     assert (found["stage"], found["unassigned"]) == ("complete", 1)
     said = field.run("fleet", "status", "ks").out
-    assert "\n1 enclave belongs to no robot, so no confirmation covers it\n" in said
+    assert "\n1 enclave belongs to no robot, so no confirmation covers it: /dispatcher\n" in said
     assert found["robots"]["r1"]["pending"] == []
     assert found["robots"]["r1"]["files"]["permissions"] == {"current": 1}
     assert field.run("fleet", "status", "ks").out.splitlines()[0] == "3 robots: 3 current"
