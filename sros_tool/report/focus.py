@@ -614,6 +614,9 @@ class _Draft:
                 most = max(side[path] for path in paths)
                 hops = f"over up to {self._hops_to_focus(before, most)} hops"
                 notes = ["directly" if most <= (2 if before else 1) else hops]
+                # An enclave can be before and after the focus.
+                if twice := sum((not before, path) in self._nodes for path in paths):
+                    notes.append(f"{twice} also {'after' if before else 'before'} the focus")
                 column = 1 if before else self.columns - 2  # one column before the outermost one
                 card = "s:" if before else "l:"
                 yield side_card(card, column, f"{len(paths)} more", notes, paths)

@@ -696,6 +696,12 @@ def test_a_focus_says_its_answer_and_shows_what_leads_to_it(
         assert texts(page, "#map .card.chosen") == {"/cmd_vel"}
         assert "/scan" not in " ".join(texts(page, "#map .card"))
         assert {"2 HOPS BEFORE", "MAY PUBLISH", "MAY SUBSCRIBE"} == texts(page, "#map text.head")
+        # Elsewhere on the page, too, rights that do not lead to the focus are left out.
+        extract = "This page has only rights that lead to or from /cmd_vel; without --focus, "
+        page.locator("#map .card.chosen").click()
+        assert extract in page.inner_text("#details-content")
+        page.click("#tab-names")
+        assert extract in page.inner_text("#names")
     with opened(browser, path, "phone") as page:
         # The flow goes from top to bottom, all of it in sight, and the keyboard leads along it.
         assert page.evaluate(

@@ -76,6 +76,8 @@ export function findingItem(finding, enclaves = [], onEnclave = null) {
   );
 }
 
+export const extractNote = (model) => (model.extract ? [el("p", { class: "soft", text: model.extract })] : []);
+
 export function enclaveDetails(model, path, act) {
   const enclave = model.enclave.get(path);
   const ties = model.tiesOf.get(path).filter(({ tie }) => !tie.common);
@@ -84,6 +86,7 @@ export function enclaveDetails(model, path, act) {
   const parts = [
     el("p", { class: "kind", text: "Enclave" }),
     el("h2", { text: path, tabindex: "-1" }),
+    ...extractNote(model),
     el(
       "p",
       { class: "actions" },
@@ -160,6 +163,7 @@ export function nameDetails(model, kind, name, act) {
   const parts = [
     el("p", { class: "kind", text: KINDS[kind] }),
     el("h2", { text: name, tabindex: "-1" }),
+    ...extractNote(model),
     el(
       "p",
       { class: "actions" },

@@ -1,7 +1,7 @@
 // Puts the page together: tabs, search, filters, the map, and what was chosen.
 
 import { MOST_BUNDLES, columns, fitted, flowScene, unwrapped } from "./arrange.js";
-import { cardDetails, enclaveDetails, equalDetails, findingItem, nameDetails } from "./details.js";
+import { cardDetails, enclaveDetails, equalDetails, extractNote, findingItem, nameDetails } from "./details.js";
 import { breakable, byId, counted, el, isSmall, svg } from "./dom.js";
 import { drawScene, legend, onlookerText, withLocks } from "./draw.js";
 import { headlines } from "./headlines.js";
@@ -345,7 +345,7 @@ function fillLists() {
   };
   byId("headlines").replaceChildren(...headlines(model, opens, act, showTab));
   byId("headlines").hidden = !byId("headlines").children.length;
-  byId("names").replaceChildren(...namesTable(model.rows, model.equal, opens));
+  byId("names").replaceChildren(...extractNote(model), ...namesTable(model.rows, model.equal, opens));
   byId("timeline").replaceChildren(...timeline(model.validities, act.enclave));
   byId("tab-differences").hidden = !model.overlay;
   if (!model.overlay) return;

@@ -47,6 +47,11 @@ export class Model {
     this.namespaces = [...new Set(this.names.flatMap(({ name }) => prefixes(name)))].sort();
   }
 
+  // Why a page with a focus lacks rights that the enclaves on it have; "" for other pages.
+  get extract() {
+    return this.scenes[0].id === "focus" ? `This page has only rights that lead to or from ${this.scenes[0].title}; without --focus, the page has all rights.` : "";
+  }
+
   bundle(kind, name) {
     return this.bundleOf.get(`${kind} ${name}`);
   }
