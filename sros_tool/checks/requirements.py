@@ -85,8 +85,8 @@ ASSUMED = FindingKind(
     "The requirement holds only with the protection of the default template. A policy has no "
     "governance, and a keystore's template can protect less.",
     "The requirements file.",
-    'Name the keystore\'s template with --template, write <?sros protect="..."?> after the name in '
-    "the policy, or check the keystore.",
+    'Name the keystore\'s template with --template, write <?sros protect="..."?> directly '
+    "after the name in the policy, before its end tag, or check the keystore.",
     prominent=True,
 )
 HOLDS_ALONE = FindingKind(
