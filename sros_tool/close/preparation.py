@@ -48,6 +48,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.names import expand
+from sros_tool.owners import user_name
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import OFFERING_RIGHT
 from sros_tool.policy.rights import Rules, policy_rights
@@ -525,7 +526,16 @@ def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
 def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
     """Yield a text for each user whose processes cannot read their enclaves."""
     owner, export = robot.export.stat().st_uid, robot.export.absolute()
-    for user in sorted({process.user for process in observed.processes}):
+    users = sorted({process.user for process in observed.processes})
+    if len(ordinary := [user for user in users if user not in (0, SEVERAL_USERS)]) > 1:
+        yield (
+            f"when sros watched, processes ran as "
+            f"{enumerated([user_name(user) for user in ordinary])}, but only one user can read the "
+            "enclaves (and Fast DDS shares no memory between users): let one user start all of "
+            f"them (in a unit: User=), and watch again: {robot.close_command} --for 1m"
+        )
+        return
+    for user in users:
         if user == SEVERAL_USERS:
             yield (
                 "a process, such as a set-user-ID program, runs as several users, and only one "
@@ -540,8 +550,10 @@ def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
             )
         if user not in (0, owner):
             yield (
-                f"processes run as user {user}, and only user {owner} can read the enclaves: "
-                f"chown -R {user} {shlex.quote(str(robot.export))}"
+                f"when sros watched, processes ran as {user_name(user)}, but only "
+                f"{user_name(owner)} can read the enclaves: chown -R {user} "
+                f"{shlex.quote(str(robot.export))} (if another user starts them now, watch again: "
+                f"{robot.close_command} --for 1m)"
             )
 
 

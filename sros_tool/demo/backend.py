@@ -26,7 +26,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import ProtectionKind
 from sros_tool.demo.casting import naming_arguments
 from sros_tool.demo.nodes import STRING, NodeOptions
-from sros_tool.demo.scenarios.model import Condition, Role
+from sros_tool.demo.scenarios.model import DEFAULT_TOPIC, Condition, Role
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.parallel import end_with_starter
@@ -373,6 +373,8 @@ def security_line(node: HandNode, environment: Mapping[str, str]) -> str:
         name = environment.get(ENCLAVE) or "/"
         security = f"secured, in the enclave {name}" if choice.enclave else "WITHOUT security"
     topic = "" if node.role is Role.ROUTER else f", topic {node.topic}"
+    if node.role is Role.LISTENER and node.topic == DEFAULT_TOPIC:
+        topic += " (--topic names another one)"
     domain = domain_of(environment)
     return f"{node.role} on {_LIBRARIES[node.backend]}{topic}, domain {domain}: {security}"
 

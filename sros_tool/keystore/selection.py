@@ -400,7 +400,7 @@ def missing_enclave_error(
         return KeystoreError(missing, why, _remedy_to_revoke(keystore, name))
     if robot := folder_of_closed_robot(root):
         folder, policy = quote(str(robot)), quote(str(robot / CLOSED_POLICY))
-        if not keystore.is_original and enclave_path(robot / CLOSED_KEYSTORE, name).is_dir():
+        if not keystore.is_original and _has_folder(enclave_path(robot / CLOSED_KEYSTORE, name)):
             return KeystoreError(
                 missing,
                 f"'{robot / CLOSED_KEYSTORE}' has the enclave, but this export does not: perhaps "
@@ -430,6 +430,13 @@ def missing_enclave_error(
         )
     create = f"`sros create_enclave {quote(str(root))} {quote(name)}`"
     return KeystoreError(missing, why, f"If the name is right, create the enclave with {create}.")
+
+
+def _has_folder(path: Path) -> bool:
+    """Return whether ``path`` is a folder; False if this user may not look."""
+    with suppress(OSError):
+        return path.is_dir()
+    return False
 
 
 def _remedy_to_revoke(keystore: OpenedKeystore, name: str) -> str:

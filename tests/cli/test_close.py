@@ -1986,6 +1986,10 @@ def test_root_reads_any_export(tmp_path: Path) -> None:
         problems = " ".join(preparation._user_problems(robot, ObservedProcesses(0, [process])))
         assert said in problems and str(SEVERAL_USERS) not in problems
         assert ("chown -R " in problems) is (user == 4321)
+    of_several = [ClosedProcess(f"/{user}", 7, ("a",), "/", user, "", "") for user in (4321, 4322)]
+    (problem,) = preparation._user_problems(robot, ObservedProcesses(0, of_several))
+    assert "processes ran as user 4321 and user 4322, but only one user can read the" in problem
+    assert "chown" not in problem and "User=" in problem
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.layout import (
+    CLOSED_KEYSTORE,
+    CLOSED_POLICY,
+    CLOSED_PROCESSES,
+    list_enclaves,
+)
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import likely_names, missing_enclave_error
 from sros_tool.pki.certificates import load_certificate
@@ -88,6 +93,25 @@ def test_a_topic_service_or_action_is_not_taken_for_an_enclave(tmp_path: Path) -
 def test_an_export_gets_it_from_its_keystore(tmp_path: Path) -> None:
     text = str(missing_enclave_error(OpenedKeystore(tmp_path), "/camera", THERE))
     assert f"export the enclave with `sros distribute_key KEYSTORE /camera {tmp_path}`." in text
+
+
+def test_the_user_of_an_export_need_not_look_into_the_keystore_of_the_closed_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in (CLOSED_PROCESSES, CLOSED_POLICY):
+        (tmp_path / name).touch()
+    refused = tmp_path / CLOSED_KEYSTORE
+    is_dir = Path.is_dir
+
+    def is_seen(path: Path) -> bool:
+        if path.is_relative_to(refused):
+            raise PermissionError(13, "Permission denied", str(path))
+        return is_dir(path)
+
+    monkeypatch.setattr(Path, "is_dir", is_seen)
+    text = str(missing_enclave_error(OpenedKeystore(tmp_path / "export"), "/camera", THERE))
+    assert text.startswith(f"enclave /camera does not exist in keystore '{tmp_path}/export'. ")
+    assert "write the enclave's rights into" in text
 
 
 def test_a_name_that_could_not_be_made_is_told_so() -> None:
