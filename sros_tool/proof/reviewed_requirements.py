@@ -15,7 +15,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sros_tool.checks.kind import Finding, FindingKind
-from sros_tool.checks.requirements import ALLOWED_BY_NAME, HOLDS_ALONE, VACUOUS, VIOLATED
+from sros_tool.checks.requirements import (
+    ALLOWED_BY_NAME,
+    HOLDS_ALONE,
+    UNKNOWN_ENCLAVE,
+    VACUOUS,
+    VIOLATED,
+)
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.names import is_expression
@@ -53,7 +59,7 @@ from sros_tool.proof.system import System
 from sros_tool.wording import first_few
 
 ONLY_THE_CHANGE = "whether the change breaks them"
-_LASTING_NOTES = (HOLDS_ALONE, ALLOWED_BY_NAME)
+_LASTING_NOTES = (HOLDS_ALONE, ALLOWED_BY_NAME, UNKNOWN_ENCLAVE)
 """Notes that each review of a policy would repeat."""
 
 
