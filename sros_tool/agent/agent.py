@@ -27,6 +27,7 @@ from sros_tool.agent.inbox import RefusedError, send
 from sros_tool.agent.install import (
     DiskFullError,
     Installation,
+    files_made_after,
     install_release,
     present_lists,
     release_time,
@@ -399,7 +400,7 @@ class _Round:
     def _fetch_and_install(self, certain_time: datetime) -> tuple[Installation, bool]:
         """Fetch and install a release; return the changes, and whether the source was reached."""
         settings, state = self._settings, self._state
-        changed_files, newer = self._changed_files(), self._newer_enclaves()
+        changed_files = self._changed_files()
         with Folder(self._folder) as opened:
             here = search_enclaves(self._folder)[0]
             waiting = {name for name in here if waits_for_answer(opened, name)}
@@ -436,23 +437,18 @@ class _Round:
         released_before: Collection[str] = ()
         with suppress(SrosError):  # without a readable seal, nothing counts as released
             released_before = self._released_files()
-        installation = self._install(release, certain_time)
         is_later = release.number != state.accepted
-        published = {path: hashlib.sha256(data).hexdigest() for path, data in release.files.items()}
+        brought: Collection[str] = ()
+        if changed_files and is_later and state.latest:
+            brought = files_made_after(state.latest, self._folder, release, changed_files)
+        installation = self._install(release, certain_time)
         repaired = (
             path
             for path, sha256 in (changed_files or {}).items()
-            if enclave_of(path) in installation.changed
-            # Before a later release, somebody may have brought its files, or other new ones, or
-            # removed an enclave to make a new key and request for it.
-            and not (
-                is_later
-                and (
-                    enclave_of(path) in newer
-                    or sha256 == published.get(path, "")
-                    or (not sha256 and enclave_of(path) in waiting)
-                )
-            )
+            if path in installation.written
+            # Before a later release, somebody may have brought new files, or removed an enclave to
+            # make a new key and request for it.
+            and not (is_later and (path in brought or (not sha256 and enclave_of(path) in waiting)))
         )
         moments = dict.fromkeys(repaired, self._machine.now)
         self._state = replace(self._state, repairs={**self._state.repairs, **moments})

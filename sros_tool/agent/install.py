@@ -27,10 +27,15 @@ from sros_tool.agent.fetch import OLD_COPY
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
-from sros_tool.keystore.confirmation import KEY_NOT_HERE, OF_OTHER_CA, OLDER_THAN_INSTALLED
+from sros_tool.keystore.confirmation import (
+    KEY_NOT_HERE,
+    OF_OTHER_CA,
+    OLDER_THAN_INSTALLED,
+    enclave_of,
+)
 from sros_tool.keystore.delivery.release import RELEASE_FILES, Release, seal_problem
 from sros_tool.keystore.delivery.robot import evaluate_delivered_files
-from sros_tool.keystore.delivery.rollback import older_list, retired_authorities
+from sros_tool.keystore.delivery.rollback import ROLES_OF_FILES, older_list, retired_authorities
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -49,6 +54,7 @@ from sros_tool.keystore.layout import (
     REQUEST,
     SEAL,
     ZENOH_FILES,
+    ZENOH_SIGNED,
     enclave_folder,
     search_enclaves,
 )
@@ -57,14 +63,16 @@ from sros_tool.keystore.transaction import Transaction, recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     authority_text,
+    common_name_of,
     digest,
+    issued_by,
     load_certificates,
     load_request,
     make_request,
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import last_update, newest_list, next_update, read_lists
+from sros_tool.pki.crl import last_update, newest_list, next_update, read_lists, signed_by
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_enclave_key
 from sros_tool.validity import iso
 from sros_tool.wording import capitalized, enumerated
@@ -112,6 +120,8 @@ class Installation(NamedTuple):
     """The newest date of the certificates and revocation lists of the whole release."""
     lists: tuple[str, ...] = ()
     """Enclaves that got only the revocation list, because the disk is full."""
+    written: frozenset[str] = frozenset()
+    """Paths of the files that were written or removed in the enclaves of the release."""
 
 
 @dataclass(slots=True)
@@ -205,6 +215,12 @@ def install_release(
         # A file that is not valid yet proves no time: the keystore's clock may have been ahead.
         _newest_validity_start(files for name, files in enclaves.items() if name not in kept),
         release_time(release),
+        written=frozenset(
+            path
+            for name, change in changes.items()
+            if name in enclaves
+            for path in (*change.write, *change.remove)
+        ),
     )
 
 
@@ -583,6 +599,71 @@ def _has_certificate(folder: Folder, name: str) -> bool:
     with suppress(SrosError, OSError):
         return folder.state(f"{enclave_folder(name)}/{CERTIFICATE_FILE}") is not None
     return False
+
+
+# ── files that came before the release ──────────────────────────────────────────────────────
+
+
+def files_made_after(
+    latest: datetime, folder: Path, release: Release, paths: Iterable[str]
+) -> frozenset[str]:
+    """Return the ``paths`` in a security folder whose files the keystore made after ``latest``.
+
+    Somebody may have brought them after the installed release, whose newest document is of
+    ``latest``, and before ``release``.  Only what the CAs in ``release`` signed counts, because a
+    stranger has no key of a CA, and no earlier document, which somebody put back.  Certificates,
+    permissions and revocation lists have dates; other files count next to a new certificate.
+    """
+    enclaves, made = release.enclaves(), set()
+    with Folder(folder) as opened:
+        for path in paths:
+            name, file = enclave_of(path), path.rpartition("/")[2]
+            with suppress(SrosError, OSError):  # a damaged file does not count
+                if name in enclaves and _is_made_after(latest, opened, name, file, enclaves[name]):
+                    made.add(path)
+    return frozenset(made)
+
+
+def _is_made_after(
+    latest: datetime, folder: Folder, name: str, file: str, sent: Mapping[str, bytes]
+) -> bool:
+    """Return whether a file of an enclave, which ``sent`` replaces, was made after ``latest``.
+
+    Raises:
+        SrosError, OSError: a file cannot be read.
+    """
+
+    def present(file: str) -> bytes:
+        return _read_file(folder, f"{enclave_folder(name)}/{file}") or b""
+
+    def authorities(file: str) -> Sequence[x509.Certificate]:
+        return load_certificates(sent.get(file, b""), file)
+
+    if file in ROLES_OF_FILES and {*load_certificates(present(file), file)} != {*authorities(file)}:
+        return False
+    if file in LIST_FILES:
+        lists, new_lists = read_lists(present(file), file), read_lists(sent.get(file, b""), file)
+        signers, new_signers = (
+            [[ca for ca in authorities(IDENTITY_CA_FILE) if signed_by(crl, ca)] for crl in each]
+            for each in (lists, new_lists)
+        )
+        is_signed = signers == new_signers and all(signers)
+        return is_signed and all(last_update(crl) > latest for crl in lists)
+    certificate = load_certificates(present(CERTIFICATE_FILE), CERTIFICATE_FILE)[0]
+    is_issued = any(issued_by(certificate, ca) for ca in authorities(IDENTITY_CA_FILE))
+    if common_name_of(certificate.subject) != name or not is_issued:
+        return False
+    if (signed_file := ZENOH_SIGNED.get(file, file)).endswith(".p7s"):
+        signed = smime.parse(present(signed_file))
+        is_signed_text = file == signed_file or present(file) == signed.text
+        if not is_signed_text or signed.problem_for(authorities(PERMISSIONS_CA_FILE)):
+            return False
+        if file == PERMISSIONS_FILE:
+            subject = subject_text(certificate.subject)
+            grant = parse_permissions(signed.document).grant_of(subject)
+            return grant is not None and grant.validity.not_before > latest
+    is_of_key = certificate.public_key() == _present_key(folder, name, sent)
+    return is_of_key and validity_of(certificate).not_before > latest
 
 
 # ── writing ────────────────────────────────────────────────────────────────────────────────

@@ -492,6 +492,183 @@ def test_what_somebody_damaged_is_named_also_if_a_later_release_replaces_it(
     assert is_mended(problem), "for a day"
 
 
+def test_only_what_was_written_is_named_as_replaced(home: Home, r1: Robot) -> None:
+    """An enclave that does not get the files of the release gets its revocation list."""
+    r1.release = home.revoked
+    r1.round()
+    place = r1.folder / "enclaves/r1/a"
+    shutil.copytree(r1.folder / "enclaves/r1/b", place, dirs_exist_ok=True)
+    before = content(place)
+    done = r1.round()
+    assert any("/r1/a does not get the files" in problem for problem in done.problems)
+    r1.release = home.release({**home.revoked.files, **list_again(home, 9)}, 4)
+    done = r1.round()
+    assert "/r1/a" in done.changed and content(place).keys() == before.keys()
+    written = [file for file, data in content(place).items() if data != before[file]]
+    assert written == ["crl.pem"], "the others are still those of /r1/b"
+    assert not any("changed or missing" in problem for problem in done.problems)
+    assert "changed or missing" not in sros("agent", "status", r1.folder).out
+
+
+def test_a_list_of_an_enclave_that_keeps_its_files_is_named_as_replaced(
+    home: Home, r1: Robot
+) -> None:
+    r1.release = home.revoked
+    r1.round()
+    place = r1.folder / "enclaves/r1/a"
+    shutil.copytree(r1.folder / "enclaves/r1/b", place, dirs_exist_ok=True)
+    (place / "crl.pem").unlink()
+    r1.release = home.release({**home.revoked.files, **list_again(home, 9)}, 4)
+    (problem,) = (each for each in r1.round().problems if "changed or missing" in each)
+    assert "1 file of" in problem and "replaced: enclaves/r1/a/crl.pem. Find" in problem
+
+
+def list_again(home: Home, number: int, root: Path | None = None) -> dict[str, bytes]:
+    """Return a later, empty revocation list of home, or of the CA in ``root``, for `NAMES`."""
+    root = root or home.root
+    authority = read_certificate(root / "public/identity_ca.cert.pem")
+    key = load_key((root / "private/identity_ca.key.pem").read_bytes(), "CA")
+    start = moment() + timedelta(hours=3) - BACKDATE
+    end = moment() + timedelta(days=9)
+    crl = sign_crl(authority, key, (), number=number, this_update=start, next_update=end)
+    return {f"enclaves{name}/crl.pem": crl for name in NAMES}
+
+
+@dataclass(frozen=True)
+class ByHand:
+    """What home made hour by hour: a release, what was brought by hand then, and a later release.
+
+    Each has another revocation list, and other files of /r1/a, with a new key in what was brought.
+    """
+
+    root: Path
+    installed: Release
+    brought: Path
+    later: Release
+
+
+@pytest.fixture(scope="module")
+def by_hand(home: Home, tmp_path_factory: pytest.TempPathFactory) -> ByHand:
+    folder = tmp_path_factory.mktemp("by_hand")
+    root = copy_of(home.root, folder / "home")
+    renewed = []
+    for hours, words in enumerate((["/r1/a"], ["/r1/a", "--new-key"], ["/r1/a", "/r1/b"]), start=2):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                "sros_tool.cli.common._clock", lambda hours=hours: moment() + timedelta(hours=hours)
+            )
+            sros("renew", root, *words, "--revoke-old").ok()
+            sros("zenoh", root, "--mode", "client" if hours == 3 else "peer").ok()
+            if hours == 3:
+                sros("distribute_key", root, *NAMES, folder / "brought").ok()
+        renewed.append(files_of(root))
+    installed, _, later = renewed
+    for path, data in installed.items():
+        if "/session." in path and "/r1/a/" not in path:  # they have no date of their own
+            (folder / "brought" / path).write_bytes(data)
+    return ByHand(
+        root,
+        home.release(installed, 4),
+        folder / "brought",
+        home.release(later, 6),
+    )
+
+
+def brought(r1: Robot, by_hand: ByHand) -> Path:
+    """Bring the files by hand after the first release was installed, and publish the later one."""
+    r1.release = by_hand.installed
+    assert not r1.round().problems
+    shutil.copytree(by_hand.brought, r1.folder, dirs_exist_ok=True)
+    r1.release = by_hand.later
+    return r1.folder / "enclaves/r1"
+
+
+def test_what_the_keystore_made_between_two_releases_is_not_named_as_changed(
+    by_hand: ByHand, r1: Robot
+) -> None:
+    brought(r1, by_hand)
+    done = r1.round()
+    assert done.release == 6 and done.changed == NAMES
+    assert not done.problems, "the lists of all, and the files of /r1/a, are of the keystore"
+
+
+def of_stranger(folder: Path) -> Path:
+    """Return a keystore whose CAs have the names of those of home."""
+    sros("generate_artifacts", "-k", folder / "stranger", "-e", "/r1/a").ok()
+    return folder / "stranger"
+
+
+CHANGED: dict[str, tuple[str, Callable[[ByHand, Home, Path], bytes | None]]] = {
+    "an older list": ("b/crl.pem", lambda _, home, __: home.revoked.files["enclaves/r1/b/crl.pem"]),
+    "an older list, too": (
+        "b/crl.pem",
+        lambda by_hand, home, _: (
+            (by_hand.brought / "enclaves/r1/b/crl.pem").read_bytes()
+            + home.revoked.files["enclaves/r1/b/crl.pem"]
+        ),
+    ),
+    "an older list next to a new certificate": (
+        "a/crl.pem",
+        lambda _, home, __: home.revoked.files["enclaves/r1/a/crl.pem"],
+    ),
+    "no list next to a new certificate": ("a/crl.pem", lambda *_: None),
+    "a damaged list": ("b/crl.pem", lambda *_: b"damaged"),
+    "a list of another CA": (
+        "b/crl.pem",
+        lambda _, home, folder: list_again(home, 7, of_stranger(folder))["enclaves/r1/b/crl.pem"],
+    ),
+    "older permissions": (
+        "a/permissions.p7s",
+        lambda _, home, __: home.first.files["enclaves/r1/a/permissions.p7s"],
+    ),
+    "new permissions of another enclave": (
+        "b/permissions.p7s",
+        lambda by_hand, *_: (by_hand.brought / "enclaves/r1/a/permissions.p7s").read_bytes(),
+    ),
+    "permissions of another CA": (
+        "a/permissions.p7s",
+        lambda _, __, folder: (of_stranger(folder) / "enclaves/r1/a/permissions.p7s").read_bytes(),
+    ),
+    "an older certificate": (
+        "a/cert.pem",
+        lambda _, home, __: home.first.files["enclaves/r1/a/cert.pem"],
+    ),
+    "a certificate of another CA": (
+        "a/cert.pem",
+        lambda _, __, folder: (of_stranger(folder) / "enclaves/r1/a/cert.pem").read_bytes(),
+    ),
+    "a new certificate of another enclave": (
+        "b/cert.pem",
+        lambda by_hand, *_: (by_hand.brought / "enclaves/r1/a/cert.pem").read_bytes(),
+    ),
+    "a Zenoh configuration next to a new certificate": ("a/session.json5", lambda *_: b"{}"),
+    "governance next to a new certificate": ("a/governance.p7s", lambda *_: b"damaged"),
+    "another CA next to a new certificate": (
+        "a/identity_ca.cert.pem",
+        lambda by_hand, _, folder: (
+            (by_hand.root / "public/identity_ca.cert.pem").read_bytes()
+            + (of_stranger(folder) / "public/identity_ca.cert.pem").read_bytes()
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", CHANGED)
+def test_what_a_stranger_changed_between_two_releases_is_named(
+    what: str, by_hand: ByHand, home: Home, r1: Robot, tmp_path: Path
+) -> None:
+    """Also if the keystore's own files were brought before: an earlier or a forged one is named."""
+    place, (file, make) = brought(r1, by_hand), CHANGED[what]
+    data = make(by_hand, home, tmp_path)
+    (place / file).unlink()
+    if data is not None:
+        (place / file).write_bytes(data)
+    (problem,) = (each for each in r1.round().problems if "changed or missing" in each)
+    named = re.findall(r"enclaves/r1/(\w/[\w.]+\w)", problem)
+    needs_it = ["a/permissions.p7s", "a/session.json5"] if file == "a/cert.pem" else []
+    assert named == [file, *needs_it], "at most the first three"
+
+
 @pytest.mark.parametrize("is_asked_for", [True, False])
 def test_a_removed_enclave_with_a_new_key_is_not_named_as_damaged(
     is_asked_for: bool, home: Home, r1: Robot, tmp_path: Path
