@@ -651,11 +651,12 @@ class Examiner:
                     "machine), ask the whole keystore: `sros explain KEYSTORE --log LOG`. "
                     f"{_otherwise(remedy)}"
                 )
-            if self._closed_robot().commands:
+            if commands := self._closed_robot().commands:
                 place = self._closed_robot().units.get(enclave.name) or _COMMANDS
                 lacks = "the node lacks a remapping, or has a wrong one"
                 # No other node need have a right to a name that only this node brings.
-                if denied.right == "reply" or _is_private(name, _served_names(asked)):
+                is_own = denied.right == "reply" or _is_private(name, _served_names(asked))
+                if is_own or not [*remapping_rules(commands.get(enclave.name, ()))]:
                     return facts, f"{remedy} Or, if {lacks}, correct its command in {place}."
                 start = f"Probably {lacks}: look at its command in {place}."
             elif not start:

@@ -1641,7 +1641,8 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     found = sros("explain", export, "--log", log, "/weed").out
     assert "had `-r odometry:=front/image` in its command when sros watched it\n" in found
     assert "Start the process by its command in start/commands.txt of" in found
-    listed["processes"] = [{"enclave": "/weed", "command": ["weed"]}]
+    other = ["weed", "--ros-args", "-r", "a:=b"]
+    listed["processes"] = [{"enclave": "/weed", "command": other}]
     (tmp_path / "processes.json").write_text(json.dumps(listed))
     found = sros("explain", export, "--log", log, "/weed").out
     wrong = "Probably the node lacks a remapping, or has a wrong one: look at its command in"
@@ -1650,10 +1651,15 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     served = sros("explain", export, "--log", client, "/weed").out
     assert "Or, if the node lacks a remapping, or has a wrong one, correct its command" in served
     assert "remedy    If the enclave at" in served and "Probably" not in served
-    listed["processes"] = [{"enclave": "/weed", "command": ["weed"], "unit": "weed.service"}]
+    listed["processes"] = [{"enclave": "/weed", "command": other, "unit": "weed.service"}]
     (tmp_path / "processes.json").write_text(json.dumps(listed))
     found = sros("explain", export, "--log", log, "/weed").out
     assert f"{wrong} weed.service." in found
+    # Without any remapping, rather the program is another version.
+    listed["processes"] = [{"enclave": "/weed", "command": ["weed"], "unit": "weed.service"}]
+    (tmp_path / "processes.json").write_text(json.dumps(listed))
+    found = sros("explain", export, "--log", log, "/weed").out
+    assert "a wrong one, correct its command in weed.service." in found and wrong not in found
     listed["processes"] = [{"enclave": "/weed", "command": command, "unit": "weed.service"}]
     (tmp_path / "processes.json").write_text(json.dumps(listed))
     found = sros("explain", export, "--log", log, "/weed").out
