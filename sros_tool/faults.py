@@ -16,6 +16,10 @@ _CLOCK_BEHIND = "Often the clock of the robot is behind."
 _RESTORE_FILE = "Restore {path} from a backup."
 _RENEW_ENCLAVE = "Renew the enclave: `sros renew {root} {enclave}`."
 _NEW_KEY = "Give the enclave another key: `sros renew {root} {enclave} --new-key`."
+_LOST_KEY = (
+    "Restore the key from a backup, or give the enclave another key: `sros renew {root} {enclave} "
+    "--new-key`."
+)
 _SET_CLOCK = (
     "Set the clock of this host; if the clock is right, renew the enclave: `sros renew {root} "
     "{enclave}`."
@@ -67,7 +71,10 @@ _REPAIR_GOVERNANCE = (
     "-in {root}/enclaves/governance.xml -out {root}/enclaves/governance.p7s -signer "
     "{root}/public/permissions_ca.cert.pem -inkey {root}/private/permissions_ca.key.pem`."
 )
-_INTACT_IN_KEYSTORE = (_SIGN_PERMISSIONS, _CREATE_MISSING_FILE, REPLACE, _REPAIR_GOVERNANCE)
+_INTACT_IN_KEYSTORE = (
+    *(_SIGN_PERMISSIONS, _CREATE_MISSING_FILE, _LOST_KEY),
+    *(REPLACE, _REPAIR_GOVERNANCE),
+)
 """Remedies for faults that mostly only an export has: files that were edited, damaged or lost."""
 _REPLACE_CA = (
     "Replace the CA and the files that expired: `sros rotate_ca {root} --finish && sros renew "
@@ -100,7 +107,7 @@ class Fault(Enum):
         'security files!" and never names the file.',
         _SOURCE_RCL,
         _CREATE_MISSING_FILE,
-        {"permissions.p7s": _SIGN_PERMISSIONS},
+        {"key.pem": _LOST_KEY, "permissions.p7s": _SIGN_PERMISSIONS},
     )
     LINK_DANGLING = (
         "link-dangling",
@@ -109,7 +116,7 @@ class Fault(Enum):
         "it links to; `sros distribute_key` exports files in place of links.",
         _SOURCE_RCL,
         _CREATE_MISSING_FILE,
-        {"permissions.p7s": _SIGN_PERMISSIONS},
+        {"key.pem": _LOST_KEY, "permissions.p7s": _SIGN_PERMISSIONS},
     )
     FILE_UNREADABLE = (
         "file-unreadable",

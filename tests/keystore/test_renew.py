@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -347,6 +348,18 @@ def test_the_key_of_another_enclave_is_not_certified(tmp_path: Path) -> None:
     assert new.public_key() != certificate(root / "enclaves/a/cert.pem").public_key()
 
 
+def test_a_lost_key_is_replaced_by_the_command_of_the_finding(tmp_path: Path) -> None:
+    """Twin: a key that was made on its robot, which has no file here, either, but its request."""
+    root = made(tmp_path / "ks", "/a")
+    (root / "enclaves/a/key.pem").unlink()
+    (command,) = re.findall(r"`sros (renew .*)`", sros("check", root).out)
+    assert f"`sros {command}`" in sros("create_enclave", root, "/a").err
+    sros(*command.split()).ok()
+    sros("check", root).ok()
+    (root / "enclaves/a/key.pem").rename(root / "enclaves/a/request.pem")
+    assert "It was generated on the robot and stays there" in sros(*command.split()).err
+
+
 def test_a_certificate_made_anew_fits_the_permissions_that_are_there(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     (root / "enclaves/a/cert.pem").unlink()
@@ -381,7 +394,7 @@ def test_every_one_that_cannot_be_renewed_is_named_at_once(
         assert ", or name the other enclaves in the command. For /n003: " in told.value.remedy
         assert snapshot(root) == before
     for name in names[4:7]:
-        (root / f"enclaves{name}/key.pem").unlink()
+        (root / f"enclaves{name}/key.pem").rename(root / f"enclaves{name}/request.pem")
     refused = sros("renew", root, *names[4:7], "--new-key").err
     assert refused.count("is not in this keystore") == 1
     assert ". The key of enclave /n004 is not in this keystore (3 such enclaves)." in refused

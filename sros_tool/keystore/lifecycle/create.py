@@ -1235,8 +1235,8 @@ class _EnclaveMaker:
                 raise KeystoreError(
                     f"enclave {name} has a certificate but no key",
                     f"Its {KEY_FILE} is missing, and the certificate does not work with a new key.",
-                    f"Restore the key, or remove '{folder / CERTIFICATE_FILE}' to create both "
-                    "again.",
+                    "Restore the key from a backup, or give the enclave another key: `sros renew "
+                    f"{quote(str(root))} {quote(name)} --new-key`.",
                 )
             return self._usable_certificate(name)
         subject = enclave_subject(name, unique=change.template.unique_subject)

@@ -24,7 +24,7 @@ from sros_tool.keystore.fleet import left_enclaves, revoke_command
 from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.issuing.ca_service import CaServiceError
 from sros_tool.keystore.issuing.enclave import EnclaveTokens, EnclaveWriter, Issuance, NewIdentity
-from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key
+from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, key_on_robot
 from sros_tool.keystore.ledger import RENEWED_BY_NAME, RESTORED, Entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
@@ -279,7 +279,7 @@ class _Renewer:
         return generate_key()
 
     def _refuse_key_on_robot(self, name: str) -> None:
-        if not has_key(enclave_path(self.change.root, name)):
+        if key_on_robot(enclave_path(self.change.root, name)):
             raise KeystoreError(
                 f"the key of enclave {name} is not in this keystore",
                 "It was generated on the robot and stays there, so no new key is generated here.",
