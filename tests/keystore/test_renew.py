@@ -352,7 +352,7 @@ def test_a_lost_key_is_replaced_by_the_command_of_the_finding(tmp_path: Path) ->
     """Twin: a key that was made on its robot, which has no file here, either, but its request."""
     root = made(tmp_path / "ks", "/a")
     (root / "enclaves/a/key.pem").unlink()
-    (command,) = re.findall(r"`sros (renew .*)`", sros("check", root).out)
+    (command,) = re.findall(r"`sros (renew .* --new-key)`", sros("check", root).out)
     assert f"`sros {command}`" in sros("create_enclave", root, "/a").err
     sros(*command.split()).ok()
     sros("check", root).ok()
