@@ -290,6 +290,15 @@ def test_a_node_in_two_enclaves(tmp_path: Path) -> None:
     assert not signed_findings([of_fleet], [*of_fleet])
 
 
+def test_whoever_signs_knows_whether_the_name_is_the_whole_subject(tmp_path: Path) -> None:
+    """With unique subjects, Cyclone DDS mistakes no enclave for another one."""
+    (tmp_path / "p.xml").write_text(policy(enclave("", "/panel"), enclave("", "/x/panel", ns="/x")))
+    for template, expected in (("production", 0), ("sros2", 1)):
+        words = ("generate_artifacts", "-k", template, "-p", "p.xml", "--template", template)
+        said = sros(*words, cwd=tmp_path).ok().err
+        assert said.count("portable.enclave-names") == expected, said
+
+
 def test_a_node_with_nearly_the_name_of_its_enclave(tmp_path: Path) -> None:
     for path, ns, node, is_near in (
         ("/left/gripper", "/left", "griper", True),

@@ -21,7 +21,7 @@ from sros_tool.checks.policies.fleets import fleet_findings
 from sros_tool.checks.policies.includes import include_findings
 from sros_tool.checks.policies.names import check_names
 from sros_tool.checks.policies.node_basics import check_nodes
-from sros_tool.checks.policies.portability import check_portability, check_zenoh
+from sros_tool.checks.policies.portability import ENCLAVE_NAMES, check_portability, check_zenoh
 from sros_tool.checks.policies.rules import check_protection, check_rules
 from sros_tool.checks.policies.statements import CheckedPolicy, split_place
 from sros_tool.errors import Note, SrosError
@@ -162,7 +162,7 @@ def signed_findings(
     """Return the errors and warnings in policies, worst first, grouped by cause.
 
     A policy for a fleet is checked for one robot of each group.  At most 1,000 enclaves are
-    checked.
+    checked.  `ENCLAVE_NAMES` is left out: whoever signs knows the subjects, and notes this.
 
     Args:
         policies: the policies.
@@ -182,7 +182,11 @@ def signed_findings(
         parts.append(replace(policy, enclaves=tuple(chosen)))
     of_fleet = any(isinstance(policy, FleetPolicy) for policy in policies)
     findings = findings_in(parts, distribution, of_fleet=of_fleet)
-    shown = [finding for finding in findings if finding.severity >= WARNING]
+    shown = [
+        finding
+        for finding in findings
+        if finding.severity >= WARNING and finding.kind is not ENCLAVE_NAMES
+    ]
     shown.sort(key=lambda finding: -finding.severity.weight)
     return list(group_by_cause(list(dict.fromkeys(shown))))
 
