@@ -363,7 +363,8 @@ def watch(
     When the union has grown, ``report`` gets the union after ``still`` seconds without a change, at
     the latest after ``patience`` seconds.  So no node is reported before it is discovered
     completely.  If a node that has just started is not announced yet, the watch
-    lasts up to ``patience`` seconds longer.
+    lasts up to ``patience`` seconds longer; if the graph still grew, up to ``Settling().still``
+    seconds longer, unless no watch of ``seconds`` seconds could have seen it stand still.
 
     An endpoint that was seen is intermittent if the graph later stood still with the endpoint's
     node, but without the endpoint.  A graph that changes may show a node that is just ending.
@@ -373,9 +374,16 @@ def watch(
     missed: set[IntermittentEndpoint] = set()
     still_seen = seen
     grown = changed = begin
-    while not stop() and (
-        seconds is None or clock() - begin < seconds + patience * bool(seen.strays)
-    ):
+    quiet = Settling().still
+
+    def is_over() -> bool:
+        now = clock()
+        if seconds is None or now - begin < seconds + patience * bool(seen.strays):
+            return False
+        is_growing = now - changed < quiet < seconds
+        return not is_growing or now - begin >= seconds + quiet
+
+    while not (stop() or is_over()):
         news = source.next(_TICK)
         now = clock()
         if news is not None:
@@ -395,7 +403,7 @@ def watch(
     stayed = {(node.fqn, node.participant) for node in seen.nodes}
     intermittent = frozenset(lost for lost in missed if (lost.node, lost.participant) in stayed)
     end = clock()
-    grew = end - changed < Settling().still
+    grew = end - changed < quiet
     is_complete = source.readings.show_everything(end)
     return Snapshot(seen, union, end - begin, is_complete, intermittent, grew)
 

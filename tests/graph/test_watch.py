@@ -11,6 +11,7 @@ from tests.graph.graphs import graph, node
 
 ONE = graph(node("/a", "publish x"))
 TWO = graph(node("/a", "publish x"), node("/b", "publish y", participant="p2"))
+THREE = TWO.union(graph(node("/c", "publish z", participant="p3")))
 SETTLING = Settling(least=2.0, still=1.0, most=10.0)
 
 
@@ -143,11 +144,13 @@ def test_a_watch_says_whether_the_graph_still_grew_at_its_end() -> None:
     grew = "new nodes or endpoints still appeared in the last 3.5 s of the watch, which took "
     for seconds, changes, why in (
         (12.0, [(0.1, ONE)], ""),
-        (12.0, [(0.1, ONE), (10.0, TWO)], f"{grew}12 s"),
+        (12.0, [(0.1, ONE), (10.0, TWO)], ""),
+        (12.0, [(0.1, ONE), (10.0, TWO), (13.0, THREE)], f"{grew}16 s"),
         (12.0, [(0.1, TWO), (10.0, ONE)], ""),
         (12.0, [(0.1, TWO), (7.0, ONE), (10.0, TWO)], ""),
         (6.0, [(1.9, ONE)], ""),
-        (5.0, [(1.9, ONE)], f"{grew}5 s"),
+        (5.0, [(1.9, ONE)], ""),
+        (3.0, [(1.9, ONE)], f"{grew}3 s"),
     ):
         script = Script(changes)
         snapshot = watch(script, seconds, script.clock, stop=lambda: False, report=lambda _: None)
