@@ -556,10 +556,9 @@ def _report(
                     "router` starts one), or the router refuses this node"
                 )
             elif node.role is Role.LISTENER:
-                say(
-                    f"heard nothing for {_SILENCE_SECONDS:.0f} s"
-                    f"{f', although {seen}' if seen else ''}"
-                )
+                none = f": no publisher of {node.topic} is visible"
+                why = f", although {seen}" if seen else none * (node.backend != ZENOH)
+                say(f"heard nothing for {_SILENCE_SECONDS:.0f} s{why}")
             continue
         if not (more := os.read(pipe, 65536)):
             return event

@@ -36,6 +36,8 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     RobotEnclaves,
     enclaves_of_closed_robot,
+    folder_of_closed_robot,
+    how_to_learn_one_process,
     is_keystore,
     is_original_keystore,
     remedy_in_closed_robot,
@@ -646,10 +648,14 @@ class Examiner:
             if len(own) == 1 and not likely:
                 facts.append(f"by exact name, the enclave may {question.word} only {own[0]}")
             if place == "export":
-                remedy = (
+                elsewhere = (
                     "If the enclave at the other end is not in this export (it may be on another "
-                    "machine), ask the whole keystore: `sros explain KEYSTORE --log LOG`. "
-                    f"{_otherwise(remedy)}"
+                    "machine), ask the whole keystore: `sros explain KEYSTORE --log LOG`."
+                )
+                remedy = (
+                    f"{remedy} {elsewhere}"
+                    if self._closed_robot().commands
+                    else f"{elsewhere} {_otherwise(remedy)}"
                 )
             if commands := self._closed_robot().commands:
                 place = self._closed_robot().units.get(enclave.name) or _COMMANDS
@@ -746,9 +752,16 @@ class Examiner:
             show = f"{' and '.join(commands)} {'shows' if len(commands) == 1 else 'show'}"
             if denial.by_rule:
                 return f"{show} the DENY, and where the policy has it: no ALLOW helps against it."
-            return (
+            robot = folder_of_closed_robot(Path(self._root)) if self._root else None
+            other_version = (
                 "If the policy is for another version of the node, use the policy of the node's "
-                f"version. Otherwise, {show} what is missing in the policy: add it{advice}."
+                "version."
+                if robot is None
+                else "If the program has a new version, which needs more rights: "
+                f"{how_to_learn_one_process(robot)}."
+            )
+            return (
+                f"{other_version} Otherwise, {show} what is missing in the policy: add it{advice}."
                 f"{_parameter_client_hint(denial, name)}"
             )
         folder = f"{root}/enclaves/{enclave.lstrip('/')}".rstrip("/")

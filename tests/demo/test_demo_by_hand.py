@@ -156,6 +156,7 @@ def test_a_listener_ends_after_its_time_and_without_a_reader(
 
     def say(line: str) -> None:
         if line.startswith("heard nothing"):
+            assert line.endswith(": no publisher of /nobody_talks is visible")
             raise BrokenPipeError
 
     def played() -> list[str]:
