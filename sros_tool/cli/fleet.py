@@ -1117,6 +1117,7 @@ def _groups(
             )
             is_silent = robot.state.value == "offline"  # what it reported last may say why
             is_problem = robot.to_do in _OFTEN_BY_PROBLEM or robot.may_have_copied_key or is_silent
+            is_problem |= robot.has_damaged_file
             clauses = (*problems(robot), *files) if is_problem else (*files, *problems(robot))
             what = _CLOCK_SENTENCE.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             clauses_by_robot[robot.robot] = what

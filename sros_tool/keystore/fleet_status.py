@@ -387,6 +387,11 @@ class RobotStatus:
         return any(problem_rank(problem) == 0 for problem in self.problems or ())
 
     @property
+    def has_damaged_file(self) -> bool:
+        """Whether the robot has an unknown file, and reports that no process would start."""
+        return self.state is State.UNKNOWN and any(map(is_unusable, self.problems or ()))
+
+    @property
     def problem_clauses(self) -> list[str]:
         """The problems, the gravest first; the robot's own words begin with "it reports"."""
         problems = enumerate(self.problems or ())
@@ -1647,7 +1652,7 @@ class _RobotFacts:
         """Return a clause if a restored keystore lacks what the robot has, or ""."""
         why = self.refusal.why if self.refusal and self.state is State.REFUSED else ""
         is_lost = why.startswith(NOT_IN_LEDGER)
-        is_unknown = self.state is State.UNKNOWN and not self.is_ahead
+        is_unknown = self._has_intact_unknown_file() and not self.is_ahead
         if not ((is_lost or is_unknown) and self.records.is_restored):
             return ""
         root = self.records.root
@@ -1657,9 +1662,23 @@ class _RobotFacts:
                 f"the keystore was restored, and made another key for {', '.join(others)} than the "
                 f"robot has. {other_keys_remedy(root, others).removesuffix('.')}"
             )
+        cause = "the keystore was restored, and lacks what it issued after the backup"
+        if not is_lost:
+            cause = "perhaps the keystore issued this after the backup from which it was restored"
         return (
-            "the keystore was restored, and lacks what it issued after the backup. If the message "
-            f"is genuine, run `sros distribute_key {quote(str(root))} --robot NAME FOLDER --force`"
+            f"{cause}. If the message is genuine, run `sros distribute_key {quote(str(root))} "
+            "--robot NAME FOLDER --force`"
+        )
+
+    def _has_intact_unknown_file(self) -> bool:
+        """Return whether the keystore does not know a file in which the robot sees no damage.
+
+        A restore of the keystore does not explain files with which no process would start.
+        """
+        unusable = {problem.partition(" ")[0] for problem in filter(is_unusable, self.reported)}
+        return self.state is State.UNKNOWN and any(
+            file.state is State.UNKNOWN and enclave_of(file.path) not in unusable
+            for file in self.different
         )
 
     # ── what it has, and what is in force ──────────────────────────────────────────────────

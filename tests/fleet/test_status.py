@@ -842,15 +842,47 @@ def test_a_robot_whose_certificate_a_restored_keystore_lacks(field: Field) -> No
     field.confirm("r1")
     assert "find out why" in row() and command not in row(), "not known to be restored"
     field.run("fleet", "publish", "ks", "pub", "--restored", "--new-folder")
-    why = "the keystore was restored, and lacks what it issued after the backup."
+    why = "perhaps the keystore issued this after the backup from which it was restored."
     assert "unknown files" in row() and why in row() and command in row()
     (field.root / "confirmed/r1.json").unlink()
+    why = "the keystore was restored, and lacks what it issued after the backup."
     assert field.send("r1").status == 1
     field.run("fleet", "publish", "ks", "pub", "--restored")
     assert "message refused" in row() and why in row() and command in row()
     field.deliver("r1")
     field.send("r1", release=0)
     assert field.states()["r1"] == "current"
+
+
+def test_a_restore_does_not_explain_a_damaged_file(field: Field) -> None:
+    """Nor files that the keystore knows; it may explain only intact, unknown ones."""
+    field.run("crl", "ks", "--refresh")
+    field.run("fleet", "publish", "ks", "pub")
+    field.deliver("r2")
+    earlier = copy_of(field.folder / "r2", field.folder / "earlier")
+    field.run("crl", "ks", "--refresh")
+    backup = copy_of(field.root, field.folder / "backup")
+    field.run("renew", "ks", "/r3/base")
+    field.run("fleet", "publish", "ks", "pub")
+    field.deliver("r3")
+    lost = (field.folder / "r3/enclaves/r3/base/permissions.p7s").read_bytes()
+    shutil.rmtree(field.root)
+    backup.rename(field.root)
+    field.run("fleet", "publish", "ks", "pub", "--restored")
+    field.deliver(*ROBOTS)
+    signed = field.folder / "r1/enclaves/r1/base/permissions.p7s"
+    signed.write_bytes(signed.read_bytes().replace(b"<publish>", b"<publish> ", 1))
+    shutil.rmtree(field.folder / "r2")
+    earlier.rename(field.folder / "r2")
+    (field.folder / "r3/enclaves/r3/base/permissions.p7s").write_bytes(lost)
+    for robot in ROBOTS:
+        field.confirm(robot)
+    told = field.run("fleet", "status", "ks", status=1).out
+    rows = {line.split()[0]: line for line in told.splitlines()}
+    reported = "it reports: /r1/base could not start: permissions.p7s: its signature does not match"
+    assert rows["r1"].partition("find out why")[2].strip().startswith(reported), rows["r1"]
+    assert "restored" not in rows["r1"] + rows["r2"]
+    assert "earlier" in rows["r2"] and "perhaps the keystore issued this" in rows["r3"]
 
 
 def test_what_an_agent_mended_does_not_fail_a_job_that_asks_so(field: Field) -> None:
