@@ -503,8 +503,9 @@ class Examiner:
         node, nodes = node_denied_own_service(denial), _served_names(answer)
         if node and not any(covers(own_node, node) for own_node in nodes):
             beginning = f"the permissions are for {_nodes_text(nodes)}, and " if nodes else ""
-            if enclaves := self._enclaves_for(node, denial.enclave):
-                cause = f"{beginning}this is the node {node}, for which there is "
+            if enclaves := self._enclaves_for_process(node, denial):
+                are = "is" if len(enclaves) == 1 else "are"
+                cause = f"{beginning}this is the node {node}, for which there {are} "
                 cause += _enclaves_text(enclaves)
                 advice = (
                     "Start the node in its enclave: `sros run "
@@ -544,6 +545,20 @@ class Examiner:
         if self._keystore:
             return self._keystore.enclaves_for(node)
         return self._policy.enclaves_for(node, enclave) if self._policy else ()
+
+    def _enclaves_for_process(self, node: str, denial: Denial) -> Sequence[str]:
+        """Return the enclaves for a node, first those that are also for the process's other nodes.
+
+        The other nodes are known from the log.
+        """
+        enclaves = self._enclaves_for(node, denial.enclave)
+        if len(enclaves) < 2:
+            return enclaves
+        others = [
+            self._enclaves_for(other, denial.enclave)
+            for other in self._logging_nodes.get(denial.process, ())
+        ]
+        return sorted(enclaves, key=lambda name: sum(name not in of_other for of_other in others))
 
     def _composed_cause(
         self, denial: Denial, node: str, nodes: Sequence[str], cause: str, advice: str

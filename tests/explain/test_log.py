@@ -952,6 +952,27 @@ def test_the_common_part_for_a_kind_of_node_is_named_and_no_remapping(
 # ── enclaves that a log names by a node, by a GUID, or not at all ──────────────────────────
 
 
+def test_of_several_enclaves_that_of_the_whole_process_is_named_first(tmp_path: Path) -> None:
+    own = '<services reply="ALLOW"><service>~/get_parameters</service></services>'
+    profile = '<profile ns="/alone" node="{}">' + own + "</profile>"
+    enclaves = "".join(
+        f'<enclave path="{path}"><profiles>{"".join(map(profile.format, nodes))}</profiles>'
+        "</enclave>"
+        for path, *nodes in (("/alone/watchdog", "watchdog"), ("/pipeline", "driver", "watchdog"))
+    )
+    policy = policy_text({"/other": own}).replace("</enclaves>", f"{enclaves}</enclaves>")
+    (tmp_path / "p.xml").write_text(policy)
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", cwd=tmp_path).ok()
+    (tmp_path / "log").write_text(
+        "[INFO] [1764500000.1] [alone.driver]: up\n"
+        "rr/alone/watchdog/get_parametersReply topic not found in allow rule. "
+        "check_create_datawriter\n"
+    )
+    said = sros("explain", "ks", "/other", "--log", "log", cwd=tmp_path).out
+    there = "this is the node /alone/watchdog, for which there are the enclaves /pipeline and /al"
+    assert there in said and "`sros run ks /pipeline -- COMMAND`" in said, said
+
+
 def test_the_enclave_of_a_node_that_runs_in_another_one_is_named(keystore: Path) -> None:
     log = LOGS / f"{FAST_14}.node_of_another_enclave.log"
     found = sros("explain", keystore, "--log", log).out
