@@ -332,6 +332,14 @@ def diff_policy(
         other_parts = compared.domains, compared.enclaves, compared.unclear, compared.changed_forms
         if count or not any(map(bool, other_parts)):
             echo(differ if count else f"the rights{of} are the same", err=True)
+        of_keystore = {right.enclave for right in difference.only_first} - second.stated_enclaves()
+        if of_keystore and (first.kind, second.kind) == ("keystore", "policy"):
+            kept = first_few(sorted(of_keystore), _MOST_NEW_LINES)
+            echo(
+                f"B lacks {kept}: signing B does not change {'it' if len(of_keystore) == 1 else 'them'}; `sros revoke` "
+                "takes away all rights of an enclave",
+                err=True,
+            )
         if compared.changed_forms:
             became = f"{counted(len(compared.changed_forms), 'name')} became absolute or relative"
             differ = "for users who put the node into another namespace, the rights differ"

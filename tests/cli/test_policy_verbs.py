@@ -501,6 +501,15 @@ def test_diff_with_a_keystore_and_its_parts(keystore: Path) -> None:
         assert "of /a" in ended.err
 
 
+def test_signing_keeps_the_enclaves_that_the_policy_lacks(tmp_path: Path) -> None:
+    for name, enclaves in (("ab", ("/a", "/b")), ("a", ("/a",))):
+        (tmp_path / name).write_text(policy_text(dict.fromkeys(enclaves, publish("/x"))))
+    sros("generate_artifacts", "-k", "ks", "-p", "ab", cwd=tmp_path).ok()
+    kept = "B lacks /b: signing B does not change it; `sros revoke` takes away all rights of an "
+    for sides, is_said in (("ks a", True), ("a ks", False), ("ab a", False), ("ks ab", False)):
+        assert (kept in sros("diff_policy", *sides.split(), cwd=tmp_path).err) is is_said, sides
+
+
 def test_diff_of_two_enclaves_compares_both(keystore: Path) -> None:
     a, b = (keystore / "enclaves" / name / "permissions.p7s" for name in "ab")
     assert len(sros("diff_policy", a, b).out.splitlines()) == 2
