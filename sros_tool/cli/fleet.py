@@ -844,7 +844,7 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield sentences about the fleet as a whole."""
     from sros_tool.keystore.fleet import fleet_edits_remedy
     from sros_tool.keystore.known_keys import lacking_enclaves_remedy
-    from sros_tool.validity import elapsed
+    from sros_tool.validity import elapsed, iso
 
     status = compared_fleet.status
     publication = status.publication
@@ -885,6 +885,14 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield (
             f"the keystore was restored, and lacks enclaves of {names}, whose certificates stay "
             f"valid. {lacking_enclaves_remedy(status.keystore)}"
+        )
+    elif status.restored and not status.older:
+        yield (
+            "the keystore was restored from a backup (sros noticed it at "
+            f"{iso(status.restored)}): no list revokes certificates that were issued after the "
+            "backup and that the keystore has not found. If somebody may have such a certificate, "
+            "replace the identity CA (docs/howto/keystore_is_lost.md, Certificates were renewed "
+            "after the backup)"
         )
     if publication and publication.altered:
         ago = elapsed(compared_fleet.at - max(publication.altered.values()))

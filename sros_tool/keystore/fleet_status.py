@@ -581,7 +581,7 @@ class PublishedMetadata:
         "older",
         "clock",
     ),
-    *("edited", "revoked_until", "publication", "robots"),
+    *("edited", "restored", "revoked_until", "publication", "robots"),
     null_if_empty=("older", "clock", "edited"),
 )
 @dataclass(frozen=True, slots=True)
@@ -641,6 +641,11 @@ class FleetStatus:
     """The kinds of files that every robot must have before the next stage of a rotation."""
     recorded: datetime | None = None
     """The time of the last entry of the ledger, in UTC; None for an empty ledger."""
+    restored: datetime | None = None
+    """When sros last noticed that the keystore was restored from a backup, in UTC: certificates may
+    exist that it lacks, and that no revocation list revokes.  Null if it was never restored, or if
+    its identity CA has been replaced since.
+    """
 
     @property
     def unassigned(self) -> int:
@@ -820,6 +825,7 @@ def fleet_status(
         groups=fleet.groups,
         awaited=stages.awaited,
         recorded=keystore.ledger_file.last_time(),
+        restored=parse_iso(restored) if (restored := restored_at(keystore)) else None,
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from fnmatch import fnmatchcase
 from functools import partial
@@ -26,6 +26,7 @@ from sros_tool.fleet.robots import (
     robot_of,
     unrecorded_enclaves,
 )
+from sros_tool.keystore.delivery.published import may_have_later_releases, read_published
 from sros_tool.keystore.fleet import arguments_for, checked_fleet, enclaves_of_robot, load_fleet
 from sros_tool.keystore.known_keys import restored_at
 from sros_tool.keystore.layout import (
@@ -128,7 +129,8 @@ def select_enclaves_to_revoke(
     if not (patterns or robots):
         # The verb reports what is wrong with a name.
         return tuple(names), tuple(_revoked_notes(revoked))
-    chosen = dict.fromkeys(select_enclaves(keystore, names, patterns))
+    with _telling_of_lost_certificates(keystore):
+        chosen = dict.fromkeys(select_enclaves(keystore, names, patterns))
     unrecorded: dict[str, UnrecordedEnclaves] = {}
     by_name = partial(_advice_on_revoking_by_name, keystore, robots)
     if fleet := checked_fleet(keystore, by_name) if robots else None:
@@ -147,11 +149,47 @@ def select_enclaves_to_revoke(
         if gone and not unrecorded[name].below and not may_exist:
             left_robots.remove(name)
             revoked += gone
-    chosen |= dict.fromkeys(_enclaves_of_robots(keystore, left_robots, True, unrecorded))
+    with _telling_of_lost_certificates(keystore):
+        chosen |= dict.fromkeys(_enclaves_of_robots(keystore, left_robots, True, unrecorded))
     below = [name for enclaves in unrecorded.values() for name in enclaves.below]
     left = {name for enclaves in unrecorded.values() for name in enclaves.naming} - chosen.keys()
     notes = [*_revoked_notes(revoked), *_unrecorded_notes(keystore, sorted(below), sorted(left))]
     return tuple(chosen), (*notes, *(_other_computers_notes(keystore, fleet, robots, chosen)))
+
+
+@contextmanager
+def _telling_of_lost_certificates(keystore: OpenedKeystore) -> Iterator[None]:
+    """Add to the remedy of an error that the keystore may lack certificates to revoke."""
+    try:
+        yield
+    except SrosError as error:
+        error.remedy = _with_lost_certificates(keystore, error.remedy)
+        raise
+
+
+def _with_lost_certificates(keystore: OpenedKeystore, remedy: str) -> str:
+    """Return how to end certificates that the keystore may lack, then ``remedy``.
+
+    The keystore may lack certificates if it was restored from a backup, or is an old copy.
+    """
+    root, publish = quote(str(keystore.root)), ""
+    if may_have_later_releases(keystore):
+        folder = quote(read_published(keystore).folder)
+        publish = (
+            f"First run `sros fleet publish {root} {folder} --restored`, which records the "
+            "certificates in this folder. "
+        )
+    elif not restored_at(keystore):
+        return remedy
+    flag = " --identity" if len(keystore.authority_files) > 1 else ""
+    otherwise = f" If the name is wrong: {remedy[:1].lower()}{remedy[1:]}" if remedy else ""
+    return (
+        "The keystore was restored from a backup, or is a copy, and may lack certificates that "
+        f"were issued after the backup. {publish}Nothing in this keystore can revoke certificates "
+        "that it lacks: they are valid until they expire, or until you replace the identity CA "
+        f"(`sros rotate_ca {root}{flag} --next` for each stage; docs/howto/keystore_is_lost.md, "
+        f"Certificates were renewed after the backup).{otherwise}"
+    )
 
 
 def _is_revoked(keystore: OpenedKeystore, name: str, now: datetime) -> bool:
@@ -359,8 +397,18 @@ def missing_enclave_error(
 ) -> SrosError:
     """Return the error for the missing enclave ``name``, with similar ``existing_enclaves``.
 
-    Without ``may_create``, the error does not suggest creating the enclave, also if it was revoked.
+    Without ``may_create``, the enclave is to be revoked: the error does not suggest creating it,
+    also if it was revoked, and says whether the keystore may lack certificates.
     """
+    error = _missing_enclave_error(keystore, name, existing_enclaves, may_create=may_create)
+    if not (may_create or _has_certificate(keystore, name)):
+        error.remedy = _with_lost_certificates(keystore, error.remedy)
+    return error
+
+
+def _missing_enclave_error(
+    keystore: OpenedKeystore, name: str, existing_enclaves: Collection[str], *, may_create: bool
+) -> SrosError:
     root = keystore.root
     if revocation := revocation_of(keystore, name):
         return _revoked_enclave_error(keystore, revocation, may_create=may_create)
@@ -446,16 +494,24 @@ def _remedy_to_revoke(keystore: OpenedKeystore, name: str) -> str:
     if not keystore.has(LEDGER):
         return capitalized(see)
     try:
-        ledger = keystore.ledger_with("enclave", name)
+        keystore.ledger_with("enclave", name)
     except SrosError:  # not readable
         return capitalized(see)
-    if any(entry.what == "certificate" and entry.enclave == name for entry in ledger.entries):
+    if _has_certificate(keystore, name):
         return (
             "The ledger has a certificate of the enclave, whose folder was removed. To revoke it, "
             f"create the enclave again (`sros create_enclave {root} {enclave}`), and run `sros "
             f"revoke {root} {enclave}`."
         )
-    return f"The ledger has no certificate of this name, so correct the name: {see}"
+    return f"Correct the name, because the ledger has no certificate of this name: {see}"
+
+
+def _has_certificate(keystore: OpenedKeystore, name: str) -> bool:
+    """Return whether the ledger can be read, and has a certificate of an enclave."""
+    with suppress(SrosError):
+        entries = keystore.ledger_with("enclave", name).entries
+        return any(entry.what == "certificate" and entry.enclave == name for entry in entries)
+    return False
 
 
 _PERMISSION_TEXTS = {

@@ -1716,8 +1716,9 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
         "write the enclave's rights into robot/policy.xml, and run `sros close robot`." in lacking
     )
     revoked = sros("revoke", "robot/keystore", "/talker", cwd=robot.folder).err
-    see = "so correct the name: see `sros list_enclaves robot/keystore`.\n"
-    assert revoked.endswith(f"The ledger has no certificate of this name, {see}")
+    see = "see `sros list_enclaves robot/keystore`.\n"
+    why = "Correct the name, because the ledger has no certificate of this name"
+    assert revoked.endswith(f"{why}: {see}")
     policy = robot.folder / "robot/policy.xml"
     signed = policy.read_text()
     (enclave,) = re.findall('(?s)<enclave path="/listener">.*?</enclave>', signed)

@@ -885,6 +885,39 @@ def test_a_restore_does_not_explain_a_damaged_file(field: Field) -> None:
     assert "earlier" in rows["r2"] and "perhaps the keystore issued this" in rows["r3"]
 
 
+def test_certificates_that_a_restored_keystore_lacks(field: Field) -> None:
+    """Neither a wrong name nor a list in force hides that such certificates are valid."""
+    field.run("fleet", "publish", "ks", "pub")
+    field.run("revoke", "ks", "--robot", "r3")
+    backup = copy_of(field.root, field.folder / "backup")
+    field.run("create_enclave", "ks", "/desk")
+    shutil.rmtree(field.root)
+    backup.rename(field.root)
+    missing = (["/desk"], ["/r9/base"], ["--robot", "r9"], ["--match", "/r9/*"])
+
+    def refusals() -> list[str]:
+        return [field.run("revoke", "ks", *words, status=2).err for words in missing]
+
+    def status() -> str:
+        return sros("fleet", "status", "ks", cwd=field.folder).out
+
+    lost, fact = "that it lacks: they are valid until", "no list revokes certificates that were"
+    rotate = "(`sros rotate_ca ks --identity --next` for each stage; docs/howto/keystore_is_lost.md"
+    assert not any("rotate_ca" in refusal for refusal in refusals())
+    shutil.rmtree(field.folder / "pub")
+    before = status()
+    field.run("fleet", "publish", "ks", "pub", "--restored", "--new-folder")
+    assert all(lost in refusal and rotate in refusal for refusal in refusals())
+    assert "/base" in refusals()[1].partition("If the name is wrong: perhaps you mean /r1")[2]
+    assert fact not in before and status().count(fact) == 1
+    assert field.status()["restored"]
+    field.run("rotate_ca", "ks", "--identity", "--next")
+    assert fact in status()
+    field.run("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    assert fact not in status() and field.status()["restored"] is None
+    assert not any("rotate_ca" in refusal for refusal in refusals())
+
+
 def test_what_an_agent_mended_does_not_fail_a_job_that_asks_so(field: Field) -> None:
     mended = "1 file of the release was changed or missing here, and replaced: x."
     for problems, status in (((mended,), 0), ((mended, f"x{READABLE_KEYS}1 key"), 1)):
