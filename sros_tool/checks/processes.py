@@ -631,8 +631,8 @@ PROCESS_COPIED_ENCLAVE = FindingKind(
     "folder, such as a revocation list, do not reach processes from the other folder.",
     "rcl 9 (rcl/src/rcl/security.c): ROS_SECURITY_KEYSTORE names the folder.",
     "Stop the process that you did not start, and replace the key of the enclave, unless you have "
-    "done so since (docs/howto/rotate.md, A key in wrong hands). If you started both processes, start them from "
-    "one folder, and remove the copy.",
+    "done so since (docs/howto/rotate.md, A key in wrong hands). If you started both processes, "
+    "start them from one folder, and remove the copy.",
 )
 ZENOH_UNREAD = FindingKind(
     "runtime.zenoh-process-unread",

@@ -335,9 +335,10 @@ def diff_policy(
         of_keystore = {right.enclave for right in difference.only_first} - second.stated_enclaves()
         if of_keystore and (first.kind, second.kind) == ("keystore", "policy"):
             kept = first_few(sorted(of_keystore), _MOST_NEW_LINES)
+            them = "it" if len(of_keystore) == 1 else "them"
             echo(
-                f"B lacks {kept}: signing B does not change {'it' if len(of_keystore) == 1 else 'them'}; `sros revoke` "
-                "takes away all rights of an enclave",
+                f"B lacks {kept}: signing B does not change {them}; `sros revoke` takes away all "
+                "rights of an enclave",
                 err=True,
             )
         if compared.changed_forms:
