@@ -635,7 +635,9 @@ def _verdict(result: Review) -> str:
     if allowed := sum(step.allowed for step in result.steps):
         words.append(f"{counted(allowed, 'step')} found only allowed changes")
     compared = f" compared with {result.base}" if result.base else ""
-    return f"{result.head}{compared}: {' and '.join(words) or _nothing_found(result)}"
+    failed = {step.kind for step in result.steps if step.status == 1}
+    option = " (--new-access allow accepts new access)" * ("new-access" in failed)
+    return f"{result.head}{compared}: {' and '.join(words) or _nothing_found(result)}{option}"
 
 
 def _nothing_found(result: Review) -> str:
