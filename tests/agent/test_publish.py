@@ -886,6 +886,26 @@ def test_revoking_after_a_restore_covers_certificates_of_after_the_backup(
     assert "restored" not in publisher.run("revoke", "ks", "/r2/base").err
 
 
+@pytest.mark.parametrize("hours", [23, 25])
+def test_settings_that_a_restored_keystore_has_lost(publisher: Home, hours: int) -> None:
+    """The twin differs by less than a day, as if the clock had been wrong."""
+    setting = ("update_keystore", "ks", "--set", f"certificates.validity={90 * 24 - hours}h")
+    publisher.run("update_keystore", "ks", "--set", "certificates.validity=90d")
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    publisher.run(*setting)
+    publisher.run("renew", "ks", "--all")
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    notes = {note.id: note.text for note in publisher.publish(restored=True).notes}
+    assert ("fleet.settings-restored" in notes) is (hours > 24)
+    if hours > 24:
+        assert "a new one would be valid for 90d" in notes["fleet.settings-restored"]
+        assert "`sros update_keystore ks --set" in notes["fleet.settings-restored"].replace(
+            str(publisher.root), "ks"
+        )
+
+
 @pytest.mark.parametrize("renewed_first", [True, False])
 def test_a_key_that_was_replaced_after_the_backup_is_not_certified_again(
     publisher: Home, renewed_first: bool

@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from itertools import count
 from pathlib import Path
 from shlex import quote
@@ -28,6 +28,7 @@ from sros_tool.keystore.layout import (
     REQUEST,
     REQUIRED_FILES,
     REVOKED,
+    SETTINGS,
     ZENOH_FILES,
     enclave_folder,
     has_key,
@@ -46,9 +47,9 @@ from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import issued_by, key_digest
+from sros_tool.pki.certificates import issued_by, key_digest, validity_of
 from sros_tool.pki.crl import REASONS, SUPERSEDED, load_crls, signed_by
-from sros_tool.validity import iso
+from sros_tool.validity import Window, duration_text, iso, parse_iso
 from sros_tool.wording import counted, first_few
 
 _MOVED_FILES = (
@@ -61,6 +62,8 @@ _MOVED_FILES = (
 )
 _PRIVATE_FILE = "key.pem"
 _MOST_SHOWN = 5
+_CLEAR_DIFFERENCE = timedelta(days=1)
+"""The difference between two validities from which they show that a setting was changed."""
 REVOKED_AGAIN = "fleet.revocations-restored"
 """The id of the note that `restored_list_note` returns."""
 REPLACED_AFTER_BACKUP = "fleet.replaced-after-backup"
@@ -319,6 +322,7 @@ def restore_revocations(
         change.finish(command="revoke", revoked_before=revoked)
     if unknown:
         change.notes.append(_unknown_note(change, unknown))
+        change.notes += _validity_notes(change, unknown)
     change.notes += _replaced_notes(change, replaced)
     outcomes = dict.fromkeys(lost_revocations, "revoked") | dict.fromkeys(replaced, "replaced")
     return change.result(RestoredRevocations, outcomes=outcomes, replaced=replaced)
@@ -433,6 +437,31 @@ def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) ->
         for serial, entry in unknown.items()
         if entry.enclave in gone and not change.keystore.has_enclave(entry.enclave)
     }
+
+
+def _validity_notes(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Iterator[Note]:
+    """Yield a note if the settings give another validity than the last ``unknown`` certificate has.
+
+    Then the setting was probably changed after the backup.  Certificates that expire with their CA
+    show nothing.
+    """
+    last = max(unknown.values(), key=lambda entry: entry.not_before)
+    setting = change.template.certificate_validity
+    ends = {iso(validity_of(ca).not_after) for ca in change.keystore.authority(IDENTITY)}
+    if not isinstance(setting, timedelta) or last.not_after in ends:
+        return
+    longest = change.template.longest_validity(last.enclave)
+    present = setting if longest is None else min(setting, longest)
+    lifetime = Window(parse_iso(last.not_before), parse_iso(last.not_after)).lifetime()
+    if abs(lifetime - present) > _CLEAR_DIFFERENCE:
+        yield Note(
+            "fleet.settings-restored",
+            f"the last certificate from after the backup, of {last.enclave}, is valid for "
+            f"{duration_text(lifetime)}; a new one would be valid for {duration_text(present)}. So "
+            f"settings were probably changed after the backup: compare '{change.root / SETTINGS}' "
+            "with the settings that you want, and change them before you renew certificates "
+            f"(`sros update_keystore {quote(str(change.root))} --set KEY=VALUE`).",
+        )
 
 
 def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
