@@ -127,7 +127,8 @@ def test_certificates_as_markdown(tmp_path: Path) -> None:
     assert fine.out == "### Certificates: no enclave needs to be renewed (30d)\n\n"
     due = sros(*words, "9000d", cwd=tmp_path)
     assert due.status == 1
-    assert due.out.startswith("### Certificates: 1 enclave needs to be renewed (9000d)\n\n- `/a ")
+    title = "### Certificates: 1 enclave and 2 shared files need to be renewed (9000d)\n\n"
+    assert due.out.startswith(f"{title}- `identity CA  until ") and "\n- `/a " in due.out
     (tmp_path / "ks/enclaves/a/cert.pem").write_text("")
     unread = "### Certificates: 0 enclaves need to be renewed (30d), 1 cannot be read\n\n- `/a "
     assert sros(*words, "30d", cwd=tmp_path).out.startswith(unread)

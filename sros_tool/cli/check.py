@@ -220,7 +220,8 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     metavar="DURATION|PERCENT|soon",
     help="List only the enclaves that expire within DURATION (30d) or have used PERCENT of their "
     "validity (66%). `soon`: a file of the enclave expires within 30 days, or within a third of "
-    "its validity if this third is shorter.",
+    "its validity if this third is shorter. CAs, the revocation list and published metadata that "
+    "expire within DURATION are listed, too; with PERCENT or `soon`, those that expire soon.",
 )
 @advisories_option
 def check(
@@ -768,51 +769,65 @@ def _show_renewals(root: Path, text: str, moment: datetime, form: str) -> int:
         parse_threshold,
     )
     from sros_tool.keystore.reader import OpenedKeystore
+    from sros_tool.keystore.shared_expiry import shared_expiry
 
     keystore = OpenedKeystore(root)
     threshold = parse_threshold(text)
     expiring = due_enclaves(keystore, threshold, moment, keystore.template)
+    shared = shared_expiry(keystore, threshold, moment, now())
     if form == "json":
-        print_json(expiring_enclaves(expiring))
+        print_json(expiring_enclaves(expiring, shared))
     else:
+        files = [file.line(moment) for file in shared.due]
+        files += [f"{problem.file}  unknown: {problem.problem}" for problem in shared.unreadable]
         due = [describe_lifetime(enclave, moment) for enclave in expiring.due]
         unknown = [f"{enclave.name}  unknown: {enclave.error}" for enclave in expiring.unreadable]
         none = f"none of {expiring.lasting} enclaves" if expiring.lasting > 1 else "no enclave"
         none_due = f"{none} needs to be renewed ({text})"
         if expiring.short_lived and not expiring.lasting:
             none_due = ""
-        left_out = expiring.short_lived_text()
-        left_out = f"not counted: {left_out}" if left_out else ""
+        left_out = [
+            f"not counted: {clause}"
+            for clause in filter(None, (expiring.short_lived_text(), shared.published_text()))
+        ]
         if form == "markdown":
-            if_none = "; ".join(filter(None, (none_due, left_out)))
-            echo_lines(renewal_markdown(due, unknown, if_none, text))
+            if_none = "; ".join(filter(None, (none_due, *left_out)))
+            echo_lines(renewal_markdown(due, unknown, files, if_none, text))
         else:
-            for line in first_lines([*due, *unknown]):
+            for line in (*first_lines([*due, *unknown]), *files):
                 echo(line)
-            for remark in filter(None, ("" if due or unknown else none_due, left_out)):
+            for remark in filter(None, ("" if due or unknown else none_due, *left_out)):
                 echo(remark, err=True)
     notes = tuple(keystore.ledger_file.clock_notes(moment))
     print_notes(notes)
-    is_unknown = expiring.unreadable or (notes and not expiring.due)
-    return NOT_DONE if is_unknown else 1 if expiring.due else 0
+    is_due = expiring.due or shared.due
+    is_unknown = expiring.unreadable or shared.unreadable or (notes and not is_due)
+    return NOT_DONE if is_unknown else 1 if is_due else 0
 
 
 def renewal_markdown(
-    due: Sequence[str], unknown: Sequence[str], text_if_none: str, threshold: str
+    due: Sequence[str],
+    unknown: Sequence[str],
+    files: Sequence[str],
+    text_if_none: str,
+    threshold: str,
 ) -> str:
-    """Return the enclaves to renew soon as Markdown, or a sentence that there are none.
+    """Return what to renew soon as Markdown, or a sentence that there is nothing.
 
-    ``due`` and ``unknown`` are lines on enclaves to renew and on enclaves that cannot be read.
-    ``text_if_none`` is the sentence, and ``threshold`` the time within which a file is due.
+    ``due`` and ``unknown`` are lines on enclaves to renew and on enclaves that cannot be read, and
+    ``files`` are lines on shared files. ``text_if_none`` is the sentence, and ``threshold`` the
+    time within which a file is due.
     """
     from sros_tool.markdown import bounded_list, code, plain
 
-    if not (due or unknown):
+    if not (due or unknown or files):
         return f"### Certificates: {plain(text_if_none)}\n"
-    need = f"{counted(len(due), 'enclave')} {'needs' if len(due) == 1 else 'need'} to be renewed"
+    things = [counted(len(due), "enclave")] if due or not files else []
+    things += [counted(len(files), "shared file")] if files else []
+    need = f"{enumerated(things)} {'needs' if len(due) + len(files) == 1 else 'need'} to be renewed"
     unread = f", {len(unknown)} cannot be read" if unknown else ""
     shown_by = "which `sros check --needs-renewal` shows"
-    listed = bounded_list(map(code, (*due, *unknown)), 4000, shown_by)
+    listed = bounded_list(map(code, (*files, *due, *unknown)), 4000, shown_by)
     return f"### Certificates: {need} {plain(f'({threshold})')}{unread}\n\n{listed}\n"
 
 

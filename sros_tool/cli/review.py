@@ -722,7 +722,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             lines = [describe_lifetime(lifetime, request.at) for lifetime in due]
             unknown = [f"{enclave.name}  unknown: {enclave.error}" for enclave in unreadable]
             nothing = not (lines or unknown)
-            return "" if nothing else renewal_markdown(lines, unknown, "", "--renew-within")
+            return "" if nothing else renewal_markdown(lines, unknown, (), "", "--renew-within")
         case StepFindings() as facts:
             facts_with_names = (f"{code(name)} {code(text)}" for text, name in facts.lines)
             return f"### {_TITLES[step.kind]}\n\n{bounded_list(facts_with_names, 6000, shown_by)}"

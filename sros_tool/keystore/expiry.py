@@ -21,6 +21,7 @@ from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.validity import Window, iso, parse_duration, time_of_file
+from sros_tool.values import shows
 from sros_tool.wording import capitalized, counted, first_few
 
 IF_EXPIRED = "If files that processes loaded have expired, restart all processes together."
@@ -128,8 +129,53 @@ class EnclaveProblem(NamedTuple):
     """Why the expiry cannot be read."""
 
 
+@shows("file", "until", "command")
+class DueFile(NamedTuple):
+    """A file that enclaves or robots share, and that expires within the given time."""
+
+    file: str
+    """The file: `CA`, `identity CA`, `permissions CA`, `revocation list`, `root metadata` or
+    `published metadata`.
+    """
+    until: datetime
+    """Expiry of the file, in UTC."""
+    command: str
+    """The command that replaces or renews the file."""
+    is_renewed_by_publishing: bool = False
+
+    def line(self, now: datetime) -> str:
+        """Return a line that says when the file expires, and how to renew it."""
+        word = "expired" if self.until < now else "until"
+        return f"{self.file}  {word} {iso(self.until)}: {self.command}"
+
+
+class FileProblem(NamedTuple):
+    """A shared file whose expiry cannot be read."""
+
+    file: str
+    """The file: `CAs`, `revocation list` or `publication`."""
+    problem: str
+    """Why the expiry cannot be read."""
+
+
+class SharedExpiry(NamedTuple):
+    """The files of a keystore that enclaves or robots share, by whether they are due.
+
+    ``published`` are files that `sros fleet publish` renews in time, without the user.
+    """
+
+    due: tuple[DueFile, ...]
+    published: tuple[DueFile, ...]
+    unreadable: tuple[FileProblem, ...]
+
+    def published_text(self) -> str:
+        """Return a clause on what `sros fleet publish` renews, with its expiry; "" for nothing."""
+        shown = ", ".join(f"{each.file} until {iso(each.until)}" for each in self.published)
+        return f"{shown} (renewed by `sros fleet publish`)" if shown else ""
+
+
 class ExpiringEnclaves(NamedTuple):
-    """The enclaves of a keystore that are due for renewal."""
+    """The enclaves and the shared files of a keystore that are due for renewal."""
 
     enclaves: Sequence[DueEnclave]
     """Enclaves that are due, with their expiry."""
@@ -137,10 +183,16 @@ class ExpiringEnclaves(NamedTuple):
     """Enclaves whose expiry cannot be read."""
     short_lived: Sequence[DueEnclave]
     """Short-lived enclaves, which ``sros renew`` renews only by name, with their expiry."""
+    files: Sequence[DueFile]
+    """CAs, revocation list and published metadata that are due."""
+    unreadable_files: Sequence[FileProblem]
+    """Shared files whose expiry cannot be read."""
+    published: Sequence[DueFile]
+    """Published metadata that ``sros fleet publish`` renews in time; it is not counted as due."""
 
 
-def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:
-    """Return the value that ``--json`` prints for enclaves that are due for renewal."""
+def expiring_enclaves(renewals: ExpiryCheck, shared: SharedExpiry) -> ExpiringEnclaves:
+    """Return the value that ``--json`` prints for what is due for renewal."""
 
     def due_enclave_values(lifetimes: Sequence[Lifetime]) -> list[DueEnclave]:
         return [
@@ -154,6 +206,9 @@ def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:
         due_enclave_values(renewals.due),
         [EnclaveProblem(enclave.name, str(enclave.error)) for enclave in renewals.unreadable],
         due_enclave_values(renewals.short_lived),
+        shared.due,
+        shared.unreadable,
+        shared.published,
     )
 
 

@@ -133,6 +133,7 @@ def make_folder(folder: Path) -> None:
     (folder / "denying.json5").write_text(denying())
     (folder / "lost/public/identity_ca.crl.pem").unlink()
     (folder / "broken/enclaves/b/cert.pem").write_text("x")
+    (folder / "broken/published.json").write_text("x")
     ledger = folder / "broken/ledger.jsonl"
     ledger.write_bytes(b"".join(ledger.read_bytes().splitlines(keepends=True)[1:]))
     for file in ("public/identity_ca.cert.pem", "public/permissions_ca.cert.pem"):

@@ -824,6 +824,27 @@ def test_a_robot_that_is_ahead_of_a_restored_keystore(field: Field) -> None:
         field.run("fleet", "publish", "ks", "pub", *(["--restored"] if to_do == "publish" else []))
 
 
+def test_what_publishing_renews_is_no_reason_to_fail(field: Field) -> None:
+    """But expired metadata is, and so is root metadata whose key is elsewhere."""
+    field.run("fleet", "publish", "ks", "pub")
+    check = ("check", "ks", "--needs-renewal")
+    for words in (("30d",), ("30d", "--at", "3d"), ("2y",)):
+        told = field.run(*check, *words).err
+        assert "not counted: " in told and ("root metadata until" in told) == (words == ("2y",))
+    (field.root / "private/fleet_root.pem").rename(field.folder / "root.pem")
+    field.run(*check, "30d")
+    command = f": sros fleet publish ks {field.folder}/pub --root-key FILE\n"
+    due = field.run(*check, "2y", status=1).out
+    assert due.startswith("root metadata  until ") and due.endswith(command)
+    path = field.root / "published.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"until": "2026-01-01T00:00:00Z"}))
+    due = field.run(*check, "30d", status=1).out
+    assert due == (
+        "published metadata  expired 2026-01-01T00:00:00Z: "
+        f"sros fleet publish ks {field.folder}/pub\n"
+    )
+
+
 def test_a_robot_whose_certificate_a_restored_keystore_lacks(field: Field) -> None:
     """The row says the cause and the command, whether it fetches or not."""
     field.run("fleet", "publish", "ks", "pub")

@@ -562,6 +562,34 @@ def test_the_check_answers_by_its_exit_status(tmp_path: Path) -> None:
     assert sros(*check, "often").status == 2
 
 
+def test_the_check_also_lists_what_enclaves_share(tmp_path: Path) -> None:
+    """CAs and revocation list, each with its command; with a share of the validity, only soon."""
+    check = ("check", "keystore", "ks", "--needs-renewal")
+    sros("create_keystore", "ks", "--template", "production", cwd=tmp_path).ok()
+    sros("create_enclave", "ks", "/a", cwd=tmp_path).ok()
+    sros("revoke", "ks", "/a", cwd=tmp_path).ok()
+    assert sros(*check, "30d", cwd=tmp_path).ok().out == ""
+    due = sros(*check, "20y", cwd=tmp_path)
+    names, commands = zip(
+        *(re.split(r"  until \S+: ", line) for line in due.out.splitlines()), strict=True
+    )
+    assert (due.status, names) == (1, ("identity CA", "permissions CA", "revocation list"))
+    assert {*commands} == {"sros rotate_ca ks --next"}, "the list ends with the CA"
+    for years, is_due in (("4y", False), ("5y", True)):  # five years, less than 90 days are left
+        ended = sros(*check, "99%", "--at", f"{5 * 365 - 60 if is_due else 4 * 365}d", cwd=tmp_path)
+        assert (ended.status, "identity CA" in ended.out) == (int(is_due), is_due), years
+    expired = sros(*check, "soon", "--at", "6y", "--json", cwd=tmp_path)
+    files = {each["file"]: each["command"] for each in json.loads(expired.out)["files"]}
+    assert files["permissions CA"] == "sros rotate_ca ks --finish"
+    sros("rotate_ca", "ks", "--same-key", "--ca-validity", "10y", cwd=tmp_path).ok()
+    listed = sros(*check, "6y", cwd=tmp_path).out.splitlines()
+    assert [line.partition("  ")[0] for line in listed] == ["permissions CA", "revocation list"]
+    assert listed[-1].endswith(": sros crl ks --refresh")
+    (tmp_path / "ks/public/permissions_ca.cert.pem").write_text("x")
+    unread = sros(*check, "30d", cwd=tmp_path)
+    assert (unread.status, unread.out.startswith("CAs  unknown: ")) == (2, True), unread
+
+
 def test_the_check_goes_on_after_one_that_cannot_be_read(tmp_path: Path) -> None:
     root = tmp_path / "ks"
     sros("create_keystore", root, "--template", "production").ok()
