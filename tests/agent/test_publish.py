@@ -894,9 +894,13 @@ def test_settings_that_a_restored_keystore_has_lost(publisher: Home, hours: int)
     backup = copy_of(publisher.root, publisher.folder / "backup")
     publisher.run(*setting)
     publisher.run("renew", "ks", "--all")
+    publisher.run("renew", "ks", "/r1/base", "--revoke-old")
     publisher.publish()
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
+    with pytest.raises(KeystoreError, match="nothing can be published"):
+        publisher.publish(restored=True)
+    publisher.run("renew", "ks", "/r1/base")
     notes = {note.id: note.text for note in publisher.publish(restored=True).notes}
     assert ("fleet.settings-restored" in notes) is (hours > 24)
     if hours > 24:

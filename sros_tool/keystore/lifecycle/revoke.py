@@ -322,7 +322,7 @@ def restore_revocations(
         change.finish(command="revoke", revoked_before=revoked)
     if unknown:
         change.notes.append(_unknown_note(change, unknown))
-        change.notes += _validity_notes(change, unknown)
+    change.notes += _validity_notes(change, unknown)
     change.notes += _replaced_notes(change, replaced)
     outcomes = dict.fromkeys(lost_revocations, "revoked") | dict.fromkeys(replaced, "replaced")
     return change.result(RestoredRevocations, outcomes=outcomes, replaced=replaced)
@@ -440,12 +440,18 @@ def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) ->
 
 
 def _validity_notes(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Iterator[Note]:
-    """Yield a note if the settings give another validity than the last ``unknown`` certificate has.
+    """Yield a note if the settings give another validity than the last later certificate has.
 
-    Then the setting was probably changed after the backup.  Certificates that expire with their CA
-    show nothing.
+    Then the setting was probably changed after the backup.  Later certificates are ``unknown``, or
+    became known since the last publication, as in a run that was refused.  Certificates that expire
+    with their CA show nothing.
     """
-    last = max(unknown.values(), key=lambda entry: entry.not_before)
+    published = max((entry.time for entry in change.keystore.entries_of("release")), default="")
+    shown = change.known.certificates_shown_after_restore(change.names)
+    later = [*unknown.values(), *(entry for entry in shown if entry.time > published)]
+    if not later:
+        return
+    last = max(later, key=lambda entry: entry.not_before)
     setting = change.template.certificate_validity
     ends = {iso(validity_of(ca).not_after) for ca in change.keystore.authority(IDENTITY)}
     if not isinstance(setting, timedelta) or last.not_after in ends:
