@@ -222,7 +222,7 @@ class Automaton:
     def levels(self) -> tuple[tuple[int, int], ...]:
         """Pairs of a number and positions (bits), sorted by the number.
 
-        The number says how many letters the nearest accepting position is away.
+        The number is the distance, in letters, from these positions to the nearest accepting one.
         """
         before: dict[int, list[int]] = {}
         for at, letters, to in self.edges:

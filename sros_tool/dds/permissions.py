@@ -445,9 +445,9 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
 def _blocked_by_denials(
     denied: list[str], denied_too: set[str], is_allowed: OverlapTest
 ) -> list[str]:
-    """Return the expressions ``denied`` in one direction that the other direction allows.
+    """Of the expressions ``denied`` in one direction, return those allowed in the other direction.
 
-    ``is_allowed`` decides on the other direction. Expressions in ``denied_too``, which are denied
+    ``is_allowed`` says what is allowed there. Expressions in ``denied_too``, which are denied
     in both directions, are left out.
     """
     return [

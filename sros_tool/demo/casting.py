@@ -366,7 +366,8 @@ def _best_cast(
 
     ``wanted`` is the only DDS topic to consider; "" stands for all topics.  An enclave that may
     only publish, or only subscribe, is better than an enclave that may do both.  The best listener
-    is an enclave in ``without_list``, which may not know which enclaves were revoked.
+    is an enclave in ``without_list``: it lacks the newest revocation list, so perhaps it does not
+    know that an enclave was revoked.
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
     serving = _service_cast(rights)

@@ -573,7 +573,7 @@ class ScenarioResult:
     cast: tuple[CastMember, ...] = ()
     """With `--keystore`: the enclaves that played a part."""
     attacked: KeystoreSummary | None = None
-    """The user's keystore; its tests that did not run lack the skipped rows (see `keystore`)."""
+    """The user's keystore; its ``not_tried`` lacks the skipped rows for now (see `keystore`)."""
 
     @property
     def wrong(self) -> tuple[RowResult, ...]:

@@ -65,7 +65,7 @@ def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certifi
 
 
 def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
-    """Return the serial numbers of all revoked certificates, including replaced certificates."""
+    """Return the serial numbers of all revoked certificates, also of those revoked as replaced."""
     recorded = {int(entry.serial, 16) for entry in keystore.entries_of("revocation")}
     listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
     return frozenset(recorded | listed)

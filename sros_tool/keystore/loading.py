@@ -95,7 +95,9 @@ _FAULTS_ON_READING = (
 )
 """Faults that a process finds before it verifies a chain."""
 _CA_FAULTS_ON_READING = (Fault.SIGNATURE_HASH, Fault.CA_CHAIN)
-"""Faults in the file of a CA that a process finds together with ``_FAULTS_ON_READING``."""
+"""Faults in the file of the identity CA; a process finds them in the same step as
+``_FAULTS_ON_READING``.
+"""
 
 
 def starts_without_security(problems: Iterable[Problem]) -> bool:

@@ -966,7 +966,8 @@ def _restricted_names(
 ) -> Iterator[tuple[str, str, tuple[_TopicOfRight, ...]]]:
     """Yield each name whose use a requirement restricts: a right, the name, and parts of the right.
 
-    For `Nobody` and `Protected`, uses at the other side of a name count as well.
+    For `Nobody` and `Protected`, the parts include those of the right that the peer needs, such as
+    publish for subscribe.
     """
     rights: RightNames = ()
     match requirement:

@@ -736,7 +736,11 @@ def _robots(paths: Iterable[str], robots: Mapping[str, Robot]) -> Iterator[Drawn
 
 
 def _guessed_units(paths: Iterable[str]) -> Iterator[DrawnUnit]:
-    """Yield sibling namespaces or enclaves that contain nearly the same enclaves."""
+    """Yield sibling namespaces or enclaves, in families that have similar enclaves below them.
+
+    At least half of the relative names of the enclaves are the same as in the most common set of
+    the family.
+    """
     waiting = [_group_by_first_part((path[1:], path) for path in paths)]
     family = 0
     while waiting:

@@ -83,8 +83,8 @@ def _injection_row(
 ) -> Row:
     """Return a row that shows whether the attacker is heard on the topic.
 
-    A permitted talker on the same topic shows that the listener can hear, unless a defense is
-    switched off (``defence_removed``).
+    The row also has a permitted talker on the same topic, which shows that the listener can hear.
+    With ``defence_removed`` (a defense is switched off), the row has no such talker.
     """
     talker, listener = talker_and_listener(victims or _victims(attacker, defence_removed))
     return Row(
@@ -249,7 +249,7 @@ def _false_server_row(
 
 _IN_CLEAR = Undefended(template=forger.unprotected)
 _OPEN_GOVERNANCE = Undefended(forger.weaker_governance)
-_STRANGERS_REFUSED = "the refusal of unauthenticated participants"
+_STRANGERS_REFUSED = "a governance that refuses unauthenticated participants"
 
 
 def _eavesdropping_row(

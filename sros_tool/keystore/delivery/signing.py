@@ -186,11 +186,11 @@ def sign_request(
 
 
 class _StatedRights(NamedTuple):
-    """The rights that a policy states for an enclave; None if the policy states none.
+    """The rights that a policy states for an enclave.
 
-    ``path`` is the enclave's path in the policy if it has placeholders of a fleet, or else "".
-    ``robot`` is the enclave's robot in the policy's fleet; None if the path has no placeholders.
-    ``robots`` are all robots of this fleet.
+    ``enclave`` is None without a policy.  If the policy names the enclave by a path with
+    placeholders of a fleet, ``path`` is this path, and ``robot`` the enclave's robot; otherwise,
+    they are "" and None.  ``robots`` are all robots of the policy's fleet.
     """
 
     enclave: Enclave | None = None

@@ -1034,7 +1034,7 @@ class _EnclaveOutcome:
 
 
 def _other_files_notes(outcomes: Mapping[str, _EnclaveOutcome]) -> Iterator[Note]:
-    """Yield a note for each reason to replace certificates of enclaves that keep their rights."""
+    """Yield a note for each reason for new certificates of enclaves with unchanged rights."""
     for reason in sorted({made.other_files for made in outcomes.values()} - {""}):
         names = [name for name, made in outcomes.items() if made.other_files == reason]
         text = f"the certificates are new, although the rights are the same: {reason}"

@@ -272,8 +272,9 @@ class RevocationListSigner:
     def recipients(self) -> Sequence[str] | None:
         """Return the enclaves that already have the list; None if some may lack it.
 
-        If the ledger has an index and a first list was signed, these are the enclaves in the
-        ledger, because every enclave that is created later gets the list.  In a rotation, the
+        The first list was linked into all enclaves, and every enclave created since then gets the
+        list.  So once a list was signed, these are the enclaves in the ledger, if it has an index.
+        In a rotation, the
         result is None, because the files of all enclaves may have to change.
         """
         if not self.present or read_rotation(self._keystore).stage is not RotationStage.NONE:
