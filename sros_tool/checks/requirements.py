@@ -93,8 +93,8 @@ HOLDS_ALONE = FindingKind(
     "requirement.holds-alone",
     NOTE,
     "a requirement that only further enclaves could break",
-    "The enclaves here cannot break the requirement, or a part of it. Or none of them has the "
-    "other side of a name in it, such as the server of a called service. For the policy of a "
+    "None of the enclaves here can break the requirement, or at least a part of it. Or none of "
+    "them has the other side of a name in it, such as the server of a called service. For a "
     "package, this is normal: the enclaves of its users could break the requirement.",
     "The requirements file.",
     "For the policy of a package, also check a robot with further enclaves: `sros check "

@@ -70,8 +70,8 @@ _crl_option = click.option(
     metavar="DURATION|PERCENT|soon",
     help="Renew the named enclaves, and all that expire within DURATION (30d) or have used PERCENT "
     "of their validity (66%). `soon`: a file of the enclave expires within 30 days, or within a "
-    "third of its validity if this third is shorter. Short-lived enclaves, except those "
-    "of the processes of `sros close`, are renewed only if named.",
+    "third of its validity if this third is shorter. A short-lived enclave is renewed only "
+    "if you name it, or if it belongs to a process that `sros close` saw on this machine.",
 )
 @click.option("--new-key", is_flag=True, help="Also create new private keys.")
 @key_option

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -243,4 +244,19 @@ def explain_log(
     findings += dropped_message_findings(
         lines, root, own_enclave.name if own_enclave else "", keystore
     )
-    return tuple(sorted(findings, key=lambda finding: (finding.id == UNKNOWN.id, finding.line)))
+    findings.sort(key=lambda finding: (finding.id == UNKNOWN.id, finding.line))
+    return tuple(_without_restarts(findings))
+
+
+def _without_restarts(findings: Iterable[LogFinding]) -> Iterator[LogFinding]:
+    """Yield the findings, but those of an enclave's later processes with the first equal one.
+
+    A unit that restarts its process repeats the same messages.
+    """
+    alike: dict[object, list[LogFinding]] = {}
+    for finding in findings:
+        is_alone = not finding.enclave or finding.id == UNKNOWN.id
+        key = finding if is_alone else replace(finding, line=0, count=0, text="", process="")
+        alike.setdefault(key, []).append(finding)
+    for first, *later in alike.values():
+        yield replace(first, count=first.count + sum(other.count for other in later))

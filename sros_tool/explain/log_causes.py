@@ -105,7 +105,7 @@ class LogFinding:
     line: int
     """First line of the log with the message, from 1."""
     count: int
-    """Number of log lines with the message."""
+    """Number of log lines with the message, also by later processes of the enclave."""
     text: str
     """Text of the first line."""
     process: str

@@ -118,9 +118,9 @@ _RESTORE_FILE = (
 _RENEW_ENCLAVE = "Renew the enclave: `sros renew KEYSTORE ENCLAVE`."
 _SIGN_PERMISSIONS = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_DOCUMENT = (
-    "`sros explain KEYSTORE ENCLAVE --log LOG` names the document. Sign permissions.p7s again: "
-    "`sros create_permission KEYSTORE ENCLAVE POLICY`. But restore governance.p7s from a backup: "
-    "every enclave depends on this file."
+    "`sros explain KEYSTORE ENCLAVE --log LOG` names the document. If it is permissions.p7s, sign "
+    "it again: `sros create_permission KEYSTORE ENCLAVE POLICY`. If it is governance.p7s, restore "
+    "it from a backup, because every enclave depends on it."
 )
 _MAKE_READABLE = (
     "Allow the user of the node to read the file, and to enter the folders above the file: `ls -lL "

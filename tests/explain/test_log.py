@@ -952,6 +952,21 @@ def test_the_common_part_for_a_kind_of_node_is_named_and_no_remapping(
 # ── enclaves that a log names by a node, by a GUID, or not at all ──────────────────────────
 
 
+def test_a_unit_that_restarts_gets_each_answer_once(tmp_path: Path) -> None:
+    """Twin: processes of unknown enclaves, which may be those of several nodes."""
+    log = "".join(
+        f"Nov 30 18:00:0{second} robot python3[10{second}]: {message}\n"
+        for second in range(3)
+        for message in (
+            "[INFO] [1764500000.1] [rcl]: Found security directory: /ks/enclaves/weed",
+            "rt/odometry topic not found in allow rule. -> Function check_create_datawriter",
+        )
+    )
+    (finding,) = explained(log)
+    assert (finding.line, finding.count, finding.process) == (2, 3, "python3[100]")
+    assert [each.count for each in explained(re.sub("Found .*", "", log))] == [1, 1, 1]
+
+
 def test_of_several_enclaves_that_of_the_whole_process_is_named_first(tmp_path: Path) -> None:
     own = '<services reply="ALLOW"><service>~/get_parameters</service></services>'
     profile = '<profile ns="/alone" node="{}">' + own + "</profile>"

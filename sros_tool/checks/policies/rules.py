@@ -52,8 +52,8 @@ NO_EFFECT = FindingKind(
     NOTE,
     "a DENY of something that no rule allows",
     "Everything that no rule allows is denied anyway. The DENY has an effect only in a policy that "
-    "users merge into their own, such as the policy of a package: there, it wins over every ALLOW "
-    "for the enclave.",
+    "users merge into their own, such as the policy of a package: in the merged policy, it wins "
+    "over every ALLOW for the enclave.",
     "DDS-Security 1.1, 9.4.1.3 (the default is DENY); sros: merge_policy never weakens a DENY.",
     "Keep the DENY if this right must never be added to the enclave.",
 )
