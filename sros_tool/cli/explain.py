@@ -1087,7 +1087,7 @@ def _show_reach(
     print_notes(followed.notes)
     if not infrastructure and not as_json:
         topics = ", ".join(topic for topic in followed.left_out if not topic.startswith("*"))
-        text = f"left out: topics that every node writes and reads ({topics}), and requests that "
+        text = f"left out: topics that every node may write ({topics}), and requests that "
         text += "only ask nodes about themselves (such as get_parameters and get_state)"
         echo(f"{text}; --infrastructure includes them", err=True)
     return 0

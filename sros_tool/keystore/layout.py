@@ -309,6 +309,8 @@ class RobotEnclaves(NamedTuple):
     """The commands of the processes on this machine, by enclave."""
     units: Mapping[str, str] = {}
     """The systemd units that start the processes; "" if you start the process by hand."""
+    users: frozenset[int] = frozenset()
+    """The ids of the users who ran the processes when sros watched."""
 
 
 def enclaves_of_closed_robot(root: Path) -> RobotEnclaves:
@@ -329,12 +331,15 @@ def enclaves_of_closed_robot(root: Path) -> RobotEnclaves:
         units = {
             str(process["enclave"]): str(process.get("unit", "")) for process in listed["processes"]
         }
+        users = frozenset(
+            int(process["user"]) for process in listed["processes"] if "user" in process
+        )
         here = commands.keys() | {*map(str, listed.get("ended", ()))}
         elsewhere = frozenset(map(str, listed["not_here"]))
     except (SrosError, ValueError, TypeError, KeyError, AttributeError):
         return RobotEnclaves()
     own = frozenset({CLOSED_OBSERVER, *here}) - elsewhere
-    return RobotEnclaves(own, elsewhere, commands, units)
+    return RobotEnclaves(own, elsewhere, commands, units, users)
 
 
 def how_to_learn_one_process(robot: Path, domain: int = 0) -> str:

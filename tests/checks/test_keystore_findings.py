@@ -203,6 +203,17 @@ def test_an_export_may_belong_to_the_user_of_the_nodes(bench: Bench, tmp_path: P
         found = keystore_findings(OpenedKeystore(keystore), Circumstances(bench.now))
         (remedy,) = (each.remedy for each in found if each.id == "keystore.foreign-owner")
         assert (f"If this is user {STRANGER}, change nothing" in remedy) is is_export
+    # Next to the list of processes of `sros close`, it is as ordered; twins: another user, a list
+    # in a folder of a stranger.
+    (tmp_path / "policy.xml").touch()
+    for user, owner, is_found in ((STRANGER, 0, False), (1, 0, True), (STRANGER, STRANGER, True)):
+        process = {"enclave": "/base", "user": user}
+        listed = {"processes": [process], "not_here": []}
+        (tmp_path / "processes.json").write_text(json.dumps(listed))
+        os.chown(tmp_path, owner, -1)
+        found = keystore_findings(OpenedKeystore(tmp_path / "export"), Circumstances(bench.now))
+        assert ("keystore.foreign-owner" in {each.id for each in found}) is is_found
+    os.chown(tmp_path, 0, -1)
 
 
 def test_a_link_to_the_keystore_that_others_own(bench: Bench) -> None:

@@ -355,6 +355,19 @@ def test_rights_that_were_put_back_are_not_signed_again(root: Path) -> None:
     assert snapshot(root) == state
 
 
+def test_expired_certificates_are_renewed_first(tmp_path: Path) -> None:
+    """In a production keystore, whose certificates expire long before its CAs."""
+    root, template = tmp_path / "ks", load_template("production")
+    create_keystore(root, template=template, now=NOW - timedelta(days=400))
+    create_enclaves(root, ["/a", "/b"], now=NOW - timedelta(days=400))
+    ninety = with_values(template, [("permissions.validity", "90d")])
+    with pytest.raises(KeystoreError, match="The certificate of enclave /a has expired") as told:
+        update_keystore(root, ninety, now=NOW)
+    (command,) = re.findall("`sros (.*)`", told.value.remedy)
+    sros(*shlex.split(command)).ok()
+    update_keystore(root, ninety, now=LATER)
+
+
 # ── stages ─────────────────────────────────────────────────────────────────────────────────
 
 

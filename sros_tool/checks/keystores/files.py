@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from shlex import quote
@@ -36,6 +36,7 @@ from sros_tool.keystore.layout import (
     ZENOH_FILES,
     UnreadPath,
     enclave_folder,
+    enclaves_of_closed_robot,
     hidden_enclaves,
     is_layout_path,
 )
@@ -256,6 +257,16 @@ _ARCHIVES = re.compile(
 """File name suffixes of archives, key containers and backup copies."""
 
 
+def _users_of_closed_robot(export: Path) -> Collection[int]:
+    """Return the users to whom `sros close` orders to give this export; empty for other folders.
+
+    A stranger could have made the folder around the export, unless it is root's or this user's.
+    """
+    if export.absolute().parent.stat().st_uid not in (0, os.geteuid()):
+        return ()
+    return enclaves_of_closed_robot(export).users
+
+
 def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -> Iterator[Finding]:
     """Yield findings about the modes, links and names of files; does not read DDS documents.
 
@@ -265,7 +276,8 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     """
     root = os.fspath(keystore.root)
     state = keystore.root.stat()
-    if state.st_uid not in (0, os.geteuid()):
+    of_robot = () if keystore.is_original else _users_of_closed_robot(keystore.root)
+    if state.st_uid not in (0, os.geteuid(), *of_robot):
         owner, remedy = user_name(state.st_uid), ""
         if not keystore.is_original:
             remedy = (

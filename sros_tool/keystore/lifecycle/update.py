@@ -82,7 +82,7 @@ from sros_tool.keystore.settings import (
 )
 from sros_tool.keystore.template import EVERYTHING, NODE_BASICS, Template, with_values
 from sros_tool.parallel import Progress
-from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key
+from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key, validity_of
 from sros_tool.policy.model import DomainProtection, Level
 from sros_tool.policy.rights import compare
 from sros_tool.translate import (
@@ -94,6 +94,7 @@ from sros_tool.translate import (
     protection_for,
 )
 from sros_tool.translate_zenoh.graph import shared_nodes
+from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.configuration import ZenohNetwork, check_network
 
@@ -557,6 +558,14 @@ class _Updater:
         certificate = self._certificates or self._changes_longest_validity(name)
         if not (self._permissions or replaces_default or certificate):
             return None
+        validity = validity_of(state.certificate)
+        if not certificate and validity.not_after <= change.now:
+            raise KeystoreError(
+                f"the certificate of enclave {name} has expired",
+                f"It was valid until {iso(validity.not_after)}.",
+                "First renew all that has expired: "
+                f"`sros renew {quote(str(change.root))} --all-expiring soon`.",
+            )
         rights: SignedRights | StatedRights
         if replaces_default:
             enclave = default_rights(self._goal.settings, name)
