@@ -131,6 +131,11 @@ def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+def is_root_pinned(agent_folder: Path) -> bool:
+    """Return whether the agent trusts root metadata."""
+    return (agent_folder / _PINNED_ROOT).is_file()
+
+
 def fetch_release(
     state: Path,
     source: str,

@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,6 +66,21 @@ class AgentSettings:
     restart_if: tuple[str, ...] = ()
     systemctl: tuple[str, ...] = ("systemctl",)
     units: tuple[Unit, ...] = ()
+
+    def options(self, *, without: Container[str] = ()) -> list[str]:
+        """Return the options of `sros agent init` that set these settings.
+
+        Fields in ``without``, and fields with their default, are left out.
+        """
+        return [
+            f"--{_OPTIONS.get(field.name, field.name.replace('_', '-'))}"
+            for field in fields(self)
+            if field.name not in without and getattr(self, field.name) != field.default
+        ]
+
+
+_OPTIONS = {"source": "from", "authorities": "ca", "units": "unit"}
+"""Field of `AgentSettings` → its option, if it has another name."""
 
 
 def agent_folder(folder: Path) -> Path:
@@ -199,23 +214,23 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
     Raises:
         DocumentError: a key is missing, unknown or of another form.
     """
-    fields: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for key, entry in value.items():
         if key in _TEXT_KEYS and isinstance(entry, str):
-            fields[_TEXT_KEYS[key]] = entry
+            values[_TEXT_KEYS[key]] = entry
         elif key in _BOOLEAN_KEYS and isinstance(entry, bool):
-            fields[key] = entry
+            values[key] = entry
         elif key in _LIST_KEYS and _is_list_of_texts(entry):
-            fields[key] = tuple(entry)
+            values[key] = tuple(entry)
         elif key == "unit" and isinstance(entry, list):
-            fields["units"] = tuple(_unit_from_table(unit, label) for unit in entry)
+            values["units"] = tuple(_unit_from_table(unit, label) for unit in entry)
         else:
             raise _invalid_settings_error(
                 label, f"{key} is not a known key, or its value has the wrong form"
             )
-    if missing := [key for key in ("robot", "from", "inbox") if _TEXT_KEYS[key] not in fields]:
+    if missing := [key for key in ("robot", "from", "inbox") if _TEXT_KEYS[key] not in values]:
         raise _invalid_settings_error(label, f"It lacks {', '.join(missing)}")
-    settings = AgentSettings(**fields)
+    settings = AgentSettings(**values)
     if problem := name_problem(settings.robot):
         raise _invalid_settings_error(
             label, f"{settings.robot!r} is not the name of a robot: {problem}"

@@ -371,7 +371,9 @@ class InitializedAgent(NamedTuple):
     robot: str
     """Name of the robot."""
     root_sha256: str | None
-    """SHA-256 of the root metadata that is trusted; null with ``--dry-run``."""
+    """SHA-256 of the root metadata of ``--root``; null with ``--dry-run`` or without ``--root``."""
+    kept: tuple[str, ...]
+    """With ``--force``: the options whose earlier values stay, such as ``--restart``."""
     changes: FileChanges
     notes: Notes
 

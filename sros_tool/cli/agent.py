@@ -5,11 +5,12 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from shlex import quote, split
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -25,7 +26,7 @@ from sros_tool.cli.common import (
     secrets,
 )
 from sros_tool.cli.program import VerbGroup
-from sros_tool.errors import SrosError, UsageError
+from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.terminal import echo, visible_line
 from sros_tool.values import file_change
 from sros_tool.wording import counted, first_few
@@ -61,17 +62,17 @@ def agent() -> None:
 
 @agent.command("init")
 @click.argument("folder", type=PATH)
-@click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
+@click.option("--robot", metavar="NAME", help="The name of this robot.")
 @click.option(
-    "--from", "source", metavar="PLACE", required=True,
+    "--from", "source", metavar="PLACE",
     help="The folder that `sros fleet publish` writes: as a URL (https, http) or a path.",
 )  # fmt: skip
 @click.option(
-    "--inbox", metavar="PLACE", required=True,
+    "--inbox", metavar="PLACE",
     help="Where the robot's messages go: a URL that accepts PUT, or a folder.",
 )  # fmt: skip
 @click.option(
-    "--root", "root_file", metavar="FILE", required=True, type=PATH,
+    "--root", "root_file", metavar="FILE", type=PATH,
     help=(
         "The first root metadata (root.json) of the publishing folder; with it, the agent verifies "
         "everything else."),
@@ -86,8 +87,8 @@ def agent() -> None:
     help="CA certificates for HTTPS, to verify the servers. [default: the system's]",
 )  # fmt: skip
 @click.option(
-    "--new-key",
-    is_flag=True,
+    "--new-key/--no-new-key",
+    default=None,
     help=(
         "Make a new key for each renewal. The robot then asks for renewal before `sros renew "
         "--all-expiring soon` would renew the certificate of the present key. [default: the key "
@@ -95,7 +96,7 @@ def agent() -> None:
     ),
 )
 @click.option(
-    "--restart", is_flag=True,
+    "--restart/--no-restart", default=None,
     help=(
         "Restart units of changed enclaves: the units of --unit, and active units that `sros "
         "units` wrote. [default: only report which restarts are due]"),
@@ -112,25 +113,31 @@ def agent() -> None:
     help="Restart units only if COMMAND exits with 0, for example because the robot stands still.",
 )  # fmt: skip
 @click.option(
-    "--systemctl", metavar="COMMAND", default="systemctl", show_default=True,
-    help="The command that restarts units, such as 'systemctl --user'.",
+    "--systemctl", metavar="COMMAND",
+    help="The command that restarts units, such as 'systemctl --user'. [default: systemctl]",
 )  # fmt: skip
-@click.option("--force", is_flag=True, help="Replace the settings of an earlier init.")
+@click.option(
+    "--force", is_flag=True,
+    help="Change the settings of an earlier init: what you do not give stays. An option that you "
+        "give replaces all its earlier values; to drop them, remove the line from agent.toml.",
+)  # fmt: skip
 @dry_run_option
 @json_option
+@click.pass_context
 def _init(
+    context: click.Context,
     folder: Path,
-    robot: str,
-    source: str,
-    inbox: str,
-    root_file: Path,
+    robot: str | None,
+    source: str | None,
+    inbox: str | None,
+    root_file: Path | None,
     authorities: tuple[str, ...],
     tls_ca: Path | None,
-    new_key: bool,
-    restart: bool,
+    new_key: bool | None,
+    restart: bool | None,
     units: tuple[str, ...],
     restart_if: str | None,
-    systemctl: str,
+    systemctl: str | None,
     force: bool,
     dry_run: bool,
     as_json: bool,
@@ -139,7 +146,8 @@ def _init(
 
     FOLDER is where `sros import` or an Ansible play installs this robot's enclaves. The agent runs
     as the owner of FOLDER. Compare the printed SHA-256 of the root metadata with the SHA-256 that
-    `sros fleet publish` printed.
+    `sros fleet publish` printed. --robot, --from, --inbox and --root are needed, but with --force,
+    all that you do not give stays as it is.
 
     Example:
       $ sros agent init /etc/sros/keystore --robot r1 --root root.json \\
@@ -148,8 +156,11 @@ def _init(
       root metadata: SHA-256 9f2c...
       $ sros agent init robot --robot r1 --root /media/usb/pub/metadata/1.root.json \\
             --from /media/usb/pub --inbox /media/usb/inbox --restart
+      $ sros agent init robot --force --restart-if /opt/robot/stands-still
+      wrote robot/.agent/agent.toml
+      kept the earlier --robot, --from, --inbox, --restart, --root
     """
-    from sros_tool.agent.fetch import pin_root
+    from sros_tool.agent.fetch import is_root_pinned, pin_root
     from sros_tool.agent.install import has_permissions_ca
     from sros_tool.agent.settings import (
         SETTINGS_FILE,
@@ -157,6 +168,7 @@ def _init(
         agent_folder,
         check_owner,
         make_agent_folder,
+        read_settings,
         render_settings,
         settings_from,
         write_settings,
@@ -177,8 +189,37 @@ def _init(
             "Name the folder that the enclaves of this robot are in, or will be in.",
         )
     check_owner(folder)
-    refuse_files_of_other_robot(folder, robot)
-    if not authorities and not has_permissions_ca(folder):
+    path = agent_folder(folder) / SETTINGS_FILE
+    existed = path.exists()
+    earlier: AgentSettings | None = None
+    if existed and force:
+        with suppress(DocumentError):  # then the options are needed, as without earlier settings
+            earlier = read_settings(folder)
+    has_root = earlier is not None and is_root_pinned(agent_folder(folder))
+    needed = {"robot": earlier, "source": earlier, "inbox": earlier, "root_file": has_root}
+    for parameter in _init.params:
+        name = parameter.name or ""
+        if not needed.get(name, True) and context.params[name] is None:
+            raise click.MissingParameter(ctx=context, param=parameter)
+    pins = sorted({pin for text in authorities for pin in read_pinned_cas(text)})
+    given: dict[str, Any] = {
+        "robot": robot,
+        "source": source and _absolute_source(source),
+        "inbox": inbox and _absolute_source(inbox),
+        "authorities": tuple(pins) if authorities else None,
+        "tls_ca": str(tls_ca.absolute()) if tls_ca else None,
+        "new_key": new_key,
+        "restart": restart,
+        "restart_if": None if restart_if is None else tuple(split(restart_if)),
+        "systemctl": None if systemctl is None else tuple(split(systemctl)),
+        "units": tuple(_parse_unit(text) for text in units) if units else None,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    settings = replace(earlier, **given) if earlier else AgentSettings(**given)
+    kept = earlier.options(without=given) if earlier else []
+    kept += ["--root"] * (root_file is None)
+    refuse_files_of_other_robot(folder, settings.robot)
+    if not settings.authorities and not has_permissions_ca(folder):
         raise UsageError(
             f"'{folder}' has no permissions CA, so this robot could trust no release",
             "No delivered enclave is there.",
@@ -186,42 +227,37 @@ def _init(
             "play; or, if their keys were made here by `sros create_request`, name the CA with "
             "--ca.",
         )
-    settings = AgentSettings(
-        robot,
-        _absolute_source(source),
-        _absolute_source(inbox),
-        authorities=tuple(sorted({pin for text in authorities for pin in read_pinned_cas(text)})),
-        tls_ca=str(tls_ca.absolute()) if tls_ca else "",
-        new_key=new_key,
-        restart=restart,
-        restart_if=tuple(split(restart_if or "")),
-        systemctl=tuple(split(systemctl)),
-        units=tuple(_parse_unit(text) for text in units),
-    )
     settings_from(parse_toml(render_settings(settings).decode()), "these options")
     if tls_ca and not tls_ca.is_file():
         raise UsageError(f"'{tls_ca}' is not a file")
-    root = read_file_or_stdin(root_file, "root metadata", max_bytes=_MOST_ROOT_BYTES)
-    path = agent_folder(folder) / SETTINGS_FILE
-    existed = path.exists()
+    root = None
+    if root_file:
+        root = read_file_or_stdin(root_file, "root metadata", max_bytes=_MOST_ROOT_BYTES)
     if existed and not force:
         raise UsageError(
             f"'{folder}' already has an agent",
             f"'{path}' exists.",
-            "Edit it, or add --force to write it again and to trust only this root metadata.",
+            "Edit it, or add --force to change the settings that you give, and to trust only this "
+            "root metadata.",
         )
     digest = ""
     if not dry_run:
         make_agent_folder(folder)
-        digest = pin_root(agent_folder(folder), root, now=now())
+        digest = "" if root is None else pin_root(agent_folder(folder), root, now=now())
         write_settings(folder, settings)
         # The recorded results may be those of another source and inbox.
         write_state(folder, replace(read_state(folder), fetched=None, sent=None, problems=()))
     if as_json:
         changes = file_change(path, existed=existed)
-        print_json(InitializedAgent(folder, dry_run, robot, digest or None, changes, ()))
+        print_json(
+            InitializedAgent(
+                folder, dry_run, settings.robot, digest or None, tuple(kept), changes, ()
+            )
+        )
         return
     echo(f"{'would write' if dry_run else 'wrote'} {path}")
+    if kept:
+        echo(f"kept the earlier {', '.join(kept)}")
     if digest:
         echo(f"root metadata: SHA-256 {digest}")
 

@@ -90,6 +90,30 @@ def world(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     yield World(tmp_path / "world", monkeypatch)
 
 
+def test_init_with_force_keeps_what_is_not_given(world: World) -> None:
+    world.run(*INIT, *UNIT, "--restart-if", "true").ok()
+    settings = world.folder / "robot/.agent/agent.toml"
+    before = settings.read_text()
+    ca = ("--ca", "ks/public/permissions_ca.cert.pem")
+    kept = "--robot, --from, --inbox, --restart, --restart-if, --systemctl, --unit, --root"
+    assert f"kept the earlier {kept}\n" in world.run("agent", "init", "robot", *ca, "--force").out
+    authorities = next(
+        line for line in settings.read_text().splitlines(keepends=True) if "author" in line
+    )
+    assert settings.read_text().replace(authorities, "") == before
+    assert world.agent().ok().out.startswith("release "), "the root metadata stays, too"
+    anew = ("--no-restart", "--restart-if", "", "--unit", "b.service=/r1/b", "--json")
+    said = json.loads(world.run("agent", "init", "robot", *anew, "--force").ok().out)
+    assert said["kept"] == ["--robot", "--from", "--inbox", "--ca", "--systemctl", "--root"]
+    text = settings.read_text()
+    assert authorities in text and "restart = false" in text and "b.service" in text
+    assert "restart_if" not in text and "a.service" not in text
+    settings.write_text("robot = 1")
+    refused = world.run("agent", "init", "robot", "--force")
+    assert refused.status == 2 and "--robot" in refused.err
+    assert "kept" not in world.run(*INIT, "--force").ok().out
+
+
 def test_from_home_to_the_robot_and_back(world: World) -> None:
     world.monkeypatch.setattr(ProcessTable, "look", lambda *_: CLOSED)
     seen = Seen()
