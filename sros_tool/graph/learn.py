@@ -1085,6 +1085,15 @@ def merge_policies(
         additions, notes = remapped_policies(additions, remaps, present, of_all_nodes)
     if enclave is not None:
         check_enclave_name(enclave)
+        joined = sorted({each.path for addition in additions for each in addition.enclaves})
+        if len(joined) > max(1, len(nodes)):
+            text = (
+                f"--enclave {enclave} joins the enclaves {first_few(joined, _MOST_SHOWN)} in one: "
+                "each process in it has the rights of all their nodes, and each DENY applies to "
+                "all. Ignore this note if these nodes run in one process. Otherwise, choose the "
+                "nodes of one process with --node, and merge the others in a second run."
+            )
+            notes.append(Note("merge.joined-enclaves", text))
         additions = [policy_in_enclave(addition, enclave) for addition in additions]
     rules = [parse_remapping(text) for text in remaps]
 

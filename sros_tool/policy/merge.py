@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from shlex import quote
 from typing import NamedTuple
 
 from lxml import etree
@@ -329,11 +330,13 @@ def kept_rights_notes(
     only missing rights, as `sros explain --log` prints it, is thus no reason for a note.
     """
     requested = defaultdict[tuple[str, str], set[Right]](set)
+    source: dict[tuple[str, str], Policy] = {}
     for addition in additions:
         for enclave in addition.enclaves:
             for node, rights in _rights_of_nodes(enclave).items():
                 requested[enclave.path, node] |= rights
-    is_added, kept = {*added}, set[Right]()
+                source.setdefault((enclave.path, node), addition)
+    is_added, kept, remedies = {*added}, set[Right](), list[str]()
     for enclave in before.enclaves:
         for node, rights in _rights_of_nodes(enclave).items():
             asked = requested.get((enclave.path, node), set())
@@ -341,7 +344,9 @@ def kept_rights_notes(
             if asked.isdisjoint(is_added) or asked.isdisjoint(own):
                 continue
             asked_rules = Rules(asked)
-            kept |= {right for right in own if not asked_rules.overlaps(right)}
+            if keeps := {right for right in own if not asked_rules.overlaps(right)}:
+                kept |= keeps
+                remedies.append(_apart(source[enclave.path, node], enclave.path, node))
     if kept:
         shown = (f"{right.enclave} {right.describe()}" for right in sorted(kept, key=order))
         text = (
@@ -349,7 +354,7 @@ def kept_rights_notes(
             " If they are of a later version of the program, keep them. If they are of an earlier "
             "version that no longer runs, take them out, or merge into the policy without this "
             "package. If they are of another program with this node name, merge with another "
-            "--namespace, or with --enclave and --remap __node:=NAME."
+            f"--namespace, or with {remedies[0]}."
         )
         yield Note("merge.kept-rights", text)
 
@@ -568,7 +573,9 @@ def merge_all(path: Path, policies: Iterable[Policy], undenied: Collection[Right
             document = _Editor(document, path, before).add(plan.entries)
             before = _checked_policy(path, document, before, plan.added)
             added += plan.added
-        shared += _texts_on_shared_enclaves(present, additions, before)
+        alone = f" With --enclave or --remap, merge {additions.file} in a run of its own."
+        texts = _texts_on_shared_enclaves(present, additions, before)
+        shared += [text + alone * (len(policies) > 1) for text in texts]
         _check_protection(path, before, additions)
     first_nodes = nodes_in_several_namespaces(first.enclaves)
     several = (
@@ -582,8 +589,8 @@ def merge_all(path: Path, policies: Iterable[Policy], undenied: Collection[Right
     twice = (
         f"the node {node} is now in {first_few([*places], _MOST_SHOWN)}, but names of nodes are "
         "unique in ROS, and a process runs in one enclave. If these are two programs, merge with "
-        "another --namespace, or with --remap __node:=NAME. If they are one program, merge with "
-        f"--enclave {next(iter(places))}."
+        f"another --namespace, or with `{_renaming(node)}`. If they are "
+        f"one program, merge with {_into(policies, node, next(iter(places)))}."
         for node, places in nodes_in_several_enclaves(before.enclaves).items()
         if first_places.get(node, {}).keys() != places.keys()
     )
@@ -613,7 +620,8 @@ def _texts_on_shared_enclaves(before: Policy, additions: Policy, after: Policy) 
             yield (
                 f"{enclave.path} has {_nodes_text(nodes)}, and now also {_nodes_text(come)}: each "
                 "process in this enclave has the rights of all these nodes. Unless they run in one "
-                "process, give one of them another enclave, with --enclave or in its policy."
+                "process, give one of them another enclave, in its policy or with "
+                f"{_apart(additions, enclave.path)}."
             )
         for node in sorted(new_rights.keys() & rights.keys()):
             if _are_different_programs(rights[node], new_rights[node]):
@@ -621,9 +629,78 @@ def _texts_on_shared_enclaves(before: Policy, additions: Policy, after: Policy) 
                     f"{enclave.path} already has a node {node}, and the merged policy gives the "
                     "node entirely different rights. If these are two programs, each of them now "
                     "has the rights of both: then merge with another --namespace, or with "
-                    "--enclave and --remap __node:=NAME. If they are two versions of one program, "
-                    "ignore this note."
+                    f"{_apart(additions, enclave.path, node)}. If they are two versions of one "
+                    "program, ignore this note."
                 )
+
+
+def _apart(policy: Policy, path: str, renamed: str = "") -> str:
+    """Return the options that merge the enclave ``path`` of ``policy`` under another name.
+
+    The node with the full name ``renamed`` gets this name, too.  All other enclaves keep their
+    names, which needs a second run.
+    """
+    name, remaps = _last(renamed), ""
+    options = f"--enclave {path.rpartition('/')[0]}/NAME"
+    if renamed:
+        options += f" {_renaming(renamed)}"
+        names = {
+            written
+            for enclave in policy.enclaves
+            for profile in enclave.all_profiles()
+            for group in profile.groups
+            for written in group.names
+            if written.startswith(f"{name}/") and enclave.path != path
+        }
+        remaps = "".join(
+            f" --remap {written}:=NAME{written.removeprefix(name)}"
+            for written in sorted(names)
+            if not is_expression(written)
+        )
+    return _with_second_run(policy, {path}, options, remaps)
+
+
+def _into(policies: Iterable[Policy], node: str, path: str) -> str:
+    """Return the options that merge ``node`` into the enclave ``path``, and only this node."""
+    for policy in policies:
+        if homes := {home for home, nodes in policy.nodes().items() if node in nodes} - {path}:
+            return _with_second_run(policy, homes, f"--enclave {path}")
+    return f"`--enclave {path}`"
+
+
+def _with_second_run(policy: Policy, paths: Collection[str], options: str, second: str = "") -> str:
+    """Return ``options`` for the nodes of the enclaves ``paths``, and those for all other nodes.
+
+    --enclave moves all nodes of a run, so it needs a --node if ``policy`` has other enclaves.
+    """
+    own, others = (
+        {
+            _last(node)
+            for path, nodes in policy.nodes().items()
+            if (path in paths) is is_own
+            for node in nodes
+        }
+        for is_own in (True, False)
+    )
+    if not others - own:
+        return f"`{options}`"
+    chosen, rest = (
+        " ".join(f"--node {quote(node)}" for node in sorted(nodes)) for nodes in (own, others - own)
+    )
+    return (
+        f"`{chosen} {options}` (then merge the other nodes into the result in a second run, with "
+        f"`{rest}{second}` in place of these options)"
+    )
+
+
+def _last(node: str) -> str:
+    return node.rpartition("/")[2]
+
+
+def _renaming(node: str) -> str:
+    """Return the option that gives the node with this full name another name."""
+    name = _last(node)
+    return f"--remap {'' if is_expression(name) else f'{name}:'}__node:=NAME"
 
 
 def _names(rights: Mapping[str, Iterable[Right]]) -> set[str]:

@@ -85,11 +85,13 @@ def test_only_a_right_of_one_node_is_one_that_every_node_needs(folder: Path, nod
 
 def test_a_merge_notes_an_enclave_that_gets_nodes_of_another_policy(folder: Path) -> None:
     of_package = policy_text({"/a": publish("/p1", "/p2"), "/b": publish("/q")})
-    (folder / "package.xml").write_text(of_package.replace('node="n"', 'node="driver"'))
+    of_package = of_package.replace('node="n"', 'node="driver"', 1).replace('"n"', '"other"')
+    (folder / "package.xml").write_text(of_package)
     said = sros("merge_policy", "a.xml", "package.xml", "--in-place").ok().err.splitlines()
     (note,) = [line for line in said if "merge.shared-enclave" in line]
     assert "/a has the node /n, and now also the node /driver: each process" in note
-    assert "give one of them another enclave, with --enclave or" in note
+    remedy = "`--node driver --enclave /NAME` (then merge the other nodes into the result in a"
+    assert f"give one of them another enclave, in its policy or with {remedy}" in note
     # A later version of the same package is no surprise.
     (folder / "package.xml").write_text(of_package.replace("/p1", "/p3"))
     assert "merge.shared-enclave" not in sros("merge_policy", "a.xml", "package.xml").ok().err
@@ -162,6 +164,58 @@ def test_a_merge_notes_a_node_of_another_package_with_the_same_name(folder: Path
         text = "note [merge.node-in-two-enclaves]: the node /valve is now in /valve, /w, but names"
         err = sros("merge_policy", *words).ok().err
         assert (text in err) is said is ("node-in-two-enclaves" in err), words
+
+
+def test_a_remedy_for_one_node_leaves_other_nodes_in_their_enclaves(folder: Path) -> None:
+    """--enclave alone would give the panel's rights to the driver, and the DENY to the panel."""
+    of_all = publish("/rosout")
+    denied = '<topics subscribe="DENY"><topic>/*motor</topic></topics>'
+    asks = '<services request="ALLOW"><service>driver/home</service></services>'
+
+    def file(name: str, text: str, *nodes: str) -> None:
+        for node in nodes:
+            text = text.replace('node="n"', f'node="{node}"', 1)
+        (folder / name).write_text(text)
+
+    def noted(*words: str) -> dict[str, str]:
+        err = sros("merge_policy", *words).ok().err
+        return dict(re.findall(r"^note \[merge\.(.*?)\]: (.*)$", err, re.MULTILINE))
+
+    file("winch.xml", policy_text({"/driver": publish("load") + of_all}), "driver")
+    enclaves = {
+        "/driver": publish("lift", "up") + of_all + denied,
+        "/panel": publish("motor") + asks,
+    }
+    file("lift.xml", policy_text(enclaves), "driver", "panel")
+    said = noted("winch.xml", "lift.xml")
+    first, second = re.findall(r"`(.*?)`", said["shared-enclave"])
+    assert first == "--node driver --enclave /NAME --remap driver:__node:=NAME"
+    assert second == "--node panel --remap driver/home:=NAME/home"
+    assert "joined-enclaves" not in said
+    said = noted("winch.xml", "lift.xml", *first.split(), "-o", "one.xml")
+    said |= noted("one.xml", "lift.xml", *second.split(), "-o", "two.xml")
+    assert not {"joined-enclaves", "shared-enclave", "node-in-two-enclaves"} & said.keys()
+    for enclave, answer in (("/NAME", 1), ("/panel", 0)):
+        assert sros("explain", "two.xml", enclave, "publish", "/motor").status == answer
+    file("kept.xml", policy_text({"/driver": publish("lift", "old") + of_all}), "driver")
+    assert f"with `{first}` (then" in noted("kept.xml", "lift.xml")["kept-rights"]
+    file("moved.xml", policy_text({"/d": publish("lift") + of_all}), "driver")
+    twice = noted("moved.xml", "lift.xml")["node-in-two-enclaves"]
+    assert "one program, merge with `--node driver --enclave /d` (then" in twice
+    assert "with `--node panel` in place of these options)" in twice
+    own = "With --enclave or --remap, merge lift.xml in a run of its own."
+    assert own in noted("a.xml", "winch.xml", "lift.xml")["shared-enclave"]
+    # Without --node, or with one node of several enclaves, it is perhaps not what was meant.
+    for words, is_said in (
+        (("lift.xml",), True),
+        (("lift.xml", "--node", "driver"), False),
+        (("lift.xml", "--node", "driver", "--node", "panel"), False),
+        (("kept.xml",), False),
+        (("kept.xml", "moved.xml", "--node", "driver"), True),
+    ):
+        said = noted("a.xml", *words, "--enclave", "/pipeline")
+        assert ("joined-enclaves" in said) is is_said, words
+    assert "Ignore this note if these nodes run in one process" in said["joined-enclaves"]
 
 
 def test_the_nodes_of_a_package_are_merged_into_the_enclave_that_composes_them(
