@@ -659,6 +659,37 @@ def test_a_node_that_was_observed_in_an_enclave_of_its_own(folder: Path) -> None
     assert "minimize.enclave-not-in-policy" in ended.err
 
 
+def test_nodes_that_were_observed_in_a_namespace_without_that_of_the_policy(folder: Path) -> None:
+    """Twins: the policy's own nodes were observed, too, or a node has another name."""
+
+    def text(**nodes: str) -> str:
+        rules = {f"{ns}/{node}": publish("x") for node, ns in nodes.items()}
+        text = policy_text(rules)
+        for node, ns in nodes.items():
+            text = text.replace('ns="/" node="n"', f'ns="{ns or "/"}" node="{node}"', 1)
+        return text
+
+    (folder / "package.xml").write_text(text(driver="", pilot=""))
+    (folder / "empty.xml").write_text('<policy version="0.2.0"><enclaves/></policy>')
+    (folder / "seen.xml").write_text(text(driver="/arm", pilot="/arm", lamp=""))
+    words = ("minimize_policy", "package.xml", "--observed", "seen.xml")
+    moved, other = [
+        line for line in sros(*words).ok().err.splitlines() if "enclave-not-in-policy" in line
+    ]
+    assert "lacks them: /arm/driver, /arm/pilot. It has nodes of these names in the" in moved
+    assert "in the namespace /. If" in moved and "lacks them: /lamp. If the policy" in other
+    (merge,) = re.findall(r"`sros (.*?)`", moved)
+    merge = merge.replace("EMPTY", "empty.xml").replace("POLICY", "package.xml")
+    sros(*merge.split(), "-o", "arm.xml").ok()
+    (folder / "seen.xml").write_text(text(driver="/arm", pilot="/arm"))
+    same = ("minimize_policy", "arm.xml", "--observed", "seen.xml", "--fail-on", "difference")
+    sros(*same).ok()
+    (folder / "own.xml").write_text(text(driver="", pilot=""))
+    assert "--namespace" not in sros(*words, "--observed", "own.xml").ok().err
+    (folder / "seen.xml").write_text(text(drive="/arm", overpilot="/arm"))
+    assert "--namespace" not in sros(*words).ok().err
+
+
 def test_nodes_of_one_process_count_for_their_own_enclaves_in_the_policy(folder: Path) -> None:
     """The observed enclave may have the name of one of them, which the policy has for it alone."""
     own = {"one": publish("x"), "two": publish("y")}

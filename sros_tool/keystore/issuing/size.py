@@ -186,7 +186,7 @@ def minimized_policy(
     result = minimize(stated, observed_rights, () if strict else _node_basics())
     if robots:
         check_narrowed(robots, result, used)
-    gaps += _scope_notes(policy, result, observed_rights)
+    gaps += _scope_notes(policy, result, observed_rights, () if robots else policies)
     if not robots:
         gaps += _node_notes(stated, policies, result, strict=strict)
     narrowed = with_names_as_written(result.policy)
@@ -288,7 +288,13 @@ def _robot_notes(unobserved: Mapping[str, Sequence[str]]) -> Iterator[Note]:
         yield Note("minimize.robot-never-observed", text)
 
 
-def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) -> Iterator[Note]:
+def _scope_notes(
+    policy: Policy, result: MinimizedPolicy, observed: Set[Right], sources: Sequence[Policy]
+) -> Iterator[Note]:
+    """Yield notes on what only the policy or only the observations have.
+
+    ``sources`` are the observed policies, for the names of nodes.
+    """
     unseen = [use.enclave for use in result.uses if not use.observed_at_all]
     if unseen:
         text = f"these enclaves were never observed, so they do not change: {', '.join(unseen)}."
@@ -296,7 +302,17 @@ def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) 
     unknown = sorted(
         {right.enclave for right in observed} - {enclave.path for enclave in policy.enclaves}
     )
-    if unknown:
+    moved = _enclaves_of_moved_nodes(policy, sources, unknown)
+    for (ns, namespace), paths in moved.items():
+        text = (
+            f"these enclaves were observed, but the policy lacks them: {', '.join(paths)}. It has "
+            f"nodes of these names in the namespace {ns}. If they are the same nodes, first put "
+            f"them into {namespace} with `sros merge_policy EMPTY POLICY --namespace {namespace}` "
+            "(EMPTY is a policy without enclaves), and use the result as POLICY."
+        )
+        yield Note("minimize.enclave-not-in-policy", text)
+    of_moved = {path for paths in moved.values() for path in paths}
+    if unknown := [path for path in unknown if path not in of_moved]:
         text = (
             f"these enclaves were observed, but the policy lacks them: {', '.join(unknown)}. If "
             "the policy has their nodes in another enclave, write that enclave into path= of the "
@@ -317,6 +333,30 @@ def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) 
             f"{first_few(denied, _MOST_SHOWN)}."
         )
         yield Note("minimize.observed-denial", text)
+
+
+def _enclaves_of_moved_nodes(
+    policy: Policy, observed: Sequence[Policy], unknown: Iterable[str]
+) -> dict[tuple[str, str], list[str]]:
+    """Return the ``unknown`` enclaves whose nodes ``policy`` has, but outside of a namespace.
+
+    The keys have the namespace of the nodes in the policy, and the one to put them into. A node of
+    the policy that was observed under its own name is another instance, and does not count.
+    """
+    seen = {node for each in observed for nodes in each.nodes().values() for node in nodes}
+    stated = {node for nodes in policy.nodes().values() for node in nodes}
+    found: dict[tuple[str, str], list[str]] = {}
+    for path in unknown:
+        nodes = {node for each in observed for node in each.nodes().get(path, ())}
+        pairs = (
+            (other.rpartition("/")[0] or "/", node.removesuffix(other))
+            for node in sorted(nodes - stated)
+            for other in sorted(stated - seen, key=len, reverse=True)
+            if node.endswith(other)
+        )
+        if not nodes & stated and (pair := next(pairs, None)):
+            found.setdefault(pair, []).append(path)
+    return found
 
 
 def _measured_enclaves(
