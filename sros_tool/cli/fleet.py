@@ -826,18 +826,40 @@ def _lines(
     )
     doubt = f" ({doubt})" if doubt else ""
     yield f"{counted(len(status.robots), 'robot')}: {counts}{doubt}"
-    yield from _fleet_facts(compared_fleet)
+    facts = list(_fleet_facts(compared_fleet))
+    yield from facts
     rows = list(_rows(compared_fleet, robots, apart=apart))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
     for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=False))
         yield "  ".join((*cells, row[4])).rstrip()
+    yield from _command_lines(status, " ".join(facts))
     for robot in status.robots if robots else ():
         yield from _file_details(robot)
     if findings:
         yield from _dds_findings(compared_fleet)
     else:
         yield from _dds_count_lines(compared_fleet)
+
+
+def _command_lines(status: FleetStatus, facts: str) -> Iterator[str]:
+    """Yield a line with the commands of each frequent task, unless ``facts`` names them."""
+    root = quote(str(status.keystore))
+    publication = status.publication
+    publish = f"sros fleet publish {root} {quote((publication and publication.folder) or 'PUB')}"
+    commands = {
+        "deliver": f"`sros distribute_key {root} --robot {{}} FOLDER --force`, bring FOLDER to the "
+        "robot, and restart its processes",
+        "publish": "" if "`sros fleet publish" in facts else f"`{publish}`",
+        "restart": "restart the robot's processes, then let it report: `sros agent run FOLDER "
+        f"--once` there, or `ssh {{}} sros fleet report FOLDER --robot {{}} | sros fleet "
+        f"confirm {root} --robot {{}} -`",
+    }
+    for to_do, command in commands.items():
+        robots = [robot.robot for robot in status.robots if robot.to_do == to_do]
+        if robots and command:
+            name = robots[0] if len(robots) == 1 else "NAME"
+            yield f"{to_do}: {command.replace('{}', name)}"
 
 
 def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:

@@ -1697,3 +1697,8 @@ def test_what_was_published_expires(home: Home) -> None:
     home.run("renew", "ks", "/r1/base")
     robots = json.loads(sros(*status, "--json", cwd=home.folder).out)["robots"]
     assert {robot["robot"]: robot["to_do"] for robot in robots}["r1"] == "publish"
+    table = sros("fleet", "status", "ks", cwd=home.folder).out
+    assert table.count("sros fleet publish") == 1, "not again below the table"
+    file.write_text(json.dumps(recorded))
+    table = sros("fleet", "status", "ks", cwd=home.folder).out
+    assert f"\npublish: `sros fleet publish ks {home.folder}/pub`\n" in table

@@ -214,6 +214,11 @@ def test_a_robot_that_was_not_reached(field: Field) -> None:
     said = field.run("fleet", "status", "ks", status=1).out
     assert "3 robots: 2 current, 1 earlier" in said
     assert f"earlier certificate, permissions of {first}" in said and "\nr2 " not in said
+    assert said.count("\ndeliver: ") == 1 and "\nrestart: " not in said
+    assert "\ndeliver: `sros distribute_key ks --robot r1 FOLDER --force`, bring FOLDER to" in said
+    field.run("renew", "ks", "--robot", "r3")
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert said.count("\ndeliver: ") == 1 and "distribute_key ks --robot NAME FOLDER" in said
 
 
 def test_a_robot_that_was_restored_from_a_backup(field: Field) -> None:
@@ -821,6 +826,8 @@ def test_a_robot_that_is_ahead_of_a_restored_keystore(field: Field) -> None:
         assert (robot["state"], robot["to_do"]) == ("unknown", to_do)
         said = f"it says that it has release {release}, from after the backup of the keystore"
         assert said in robot["notes"][0]
+        table = field.run("fleet", "status", "ks", status=1).out
+        assert "\npublish: " not in table, "the line above the table has the options"
         field.run("fleet", "publish", "ks", "pub", *(["--restored"] if to_do == "publish" else []))
 
 
@@ -1347,7 +1354,7 @@ def test_fifty_robots_of_which_the_same_is_to_be_said_share_a_line(field: Field)
     lines = field.run("fleet", "status", "ks", status=1).out.splitlines()
     assert lines[0] == "50 robots: 3 current, 1 earlier, 46 never confirmed"
     assert lines[4].endswith("  each: 1 enclave")
-    assert [re.split("  +", line)[:4] for line in lines[3:7]] == [
+    assert [re.split("  +", line)[:4] for line in lines[3:6]] == [
         ["r1", "earlier", re.split("  +", lines[3])[2], "deliver"],
         ["r4 to r19, r21 to r50 (46 robots)", "never confirmed", "-", "deliver"],
         ["r2, r3, r20", "current", re.split("  +", lines[5])[2]],
@@ -1378,7 +1385,8 @@ def test_robots_that_differ_in_their_names_share_a_line(field: Field) -> None:
     field.deliver(*ROBOTS)
     for robot in ("r1", "r2"):
         field.send(robot, running={f"/{robot}/base": RunningFiles.EARLIER})
-    rows = field.run("fleet", "status", "ks", status=1).out.splitlines()[3:]
+    *rows, command = field.run("fleet", "status", "ks", status=1).out.splitlines()[3:]
+    assert command.startswith("restart: ") and "`sros agent run FOLDER --once` there" in command
     columns = [re.split("  +", row) for row in rows]
     text = "processes of /{robot}/base have not loaded the installed files"
     assert [row[:2] + row[3:] for row in columns] == [
