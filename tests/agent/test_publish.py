@@ -51,7 +51,7 @@ from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import KnownKeys
-from sros_tool.keystore.layout import CRL, FLEET, ca_key_path
+from sros_tool.keystore.layout import CRL, FLEET, ca_key_path, fleet_key_path
 from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
 from sros_tool.keystore.ledger import LATER_RELEASE, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
@@ -1021,6 +1021,13 @@ def test_replaced_keys_of_publishing_that_only_robots_know(publisher: Home) -> N
     shutil.rmtree(publisher.root)
     shutil.rmtree(publisher.pub)
     backup.rename(publisher.root)
+    key = publisher.root / fleet_key_path("timestamp")
+    lost = key.rename(publisher.folder / "key")
+    for dry_run in (True, False):
+        with pytest.raises(SrosError) as refused:
+            publisher.publish(restored=True, new_folder=True, dry_run=dry_run)
+        assert "root metadata up to version 1, and nothing in" in refused.value.remedy
+    lost.rename(key)
     notes = {n.id: n.text for n in publisher.publish(restored=True, new_folder=True).notes}
     assert "the root metadata up to version 1, and nothing in" in notes["fleet.root-not-seen"]
     assert "--rotate-key" in robot.refuses(FetchProblem.NOT_SIGNED).remedy

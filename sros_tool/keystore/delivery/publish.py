@@ -666,16 +666,23 @@ class _Publication:
         self.notes: list[Note] = []
         self._restored_texts: list[str] = []
         self._is_restored = False
+        self._root_note: Note | None = None
         self._later: Sequence[LaterChange] = ()
         self._revoked: Collection[str] = frozenset()
         """Enclaves that a dry run with ``restored`` would revoke again."""
 
     @contextmanager
     def reporting_restore(self) -> Iterator[None]:
-        """Add to an error what `check_restored` has already changed in the keystore."""
+        """Add to an error what `check_restored` has already changed in the keystore.
+
+        The error also says which root metadata the keystore knows, if robots may know a later one.
+        """
         try:
             yield
         except SrosError as error:
+            if self._root_note:
+                text = self._root_note.text
+                error.remedy = f"{error.remedy.rstrip('.')}. {capitalized(text)}".lstrip(". ")
             if self._restored_texts:
                 remedy = f"{error.remedy.rstrip('.')}. " if error.remedy else ""
                 done = "; ".join(self._restored_texts)
@@ -727,6 +734,8 @@ class _Publication:
         if restored and not is_later:
             self._check_removed()
         if restored:
+            if is_lost and not self._has_later_root:
+                self._root_note = self._unseen_root_note()
             refuse_lost_ca(self.keystore)
             forgotten = LostRecords(self.keystore, self._now)
             if is_later or unknown:
@@ -742,8 +751,8 @@ class _Publication:
             self._restore(forgotten, keyring)
             if self._unread:
                 self.notes.append(self._unread_note())
-            if is_lost and not self._has_later_root:
-                self.notes.append(self._unseen_root_note())
+            if self._root_note:
+                self.notes.append(self._root_note)
             self._is_restored = True
         self._check_removed()
         if is_lost or restored:
