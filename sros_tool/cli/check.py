@@ -18,7 +18,7 @@ import click
 from click.core import ParameterSource
 
 from sros_tool import __version__
-from sros_tool.cli.changed import first_lines
+from sros_tool.cli.changed import MAX_NAMES, first_lines
 from sros_tool.cli.common import (
     KEYSTORE_VARIABLE,
     PATH,
@@ -57,7 +57,7 @@ from sros_tool.dds.decision.vendors import TESTED, ZENOH, Vendor
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines, visible, visible_json
 from sros_tool.values import file_change, shows, versioned
-from sros_tool.wording import counted, enumerated
+from sros_tool.wording import counted, enumerated, first_few
 
 if TYPE_CHECKING:
     from sros_tool.checks.keystores.opened import Circumstances
@@ -794,7 +794,7 @@ def _show_renewals(root: Path, text: str, moment: datetime, form: str) -> int:
             if_none = "; ".join(filter(None, (none_due, *left_out)))
             echo_lines(renewal_markdown(due, unknown, files, if_none, text))
         else:
-            for line in (*first_lines([*due, *unknown]), *files):
+            for line in (*_renewal_lines(due, unknown), *files):
                 echo(line)
             for remark in filter(None, ("" if due or unknown else none_due, *left_out)):
                 echo(remark, err=True)
@@ -803,6 +803,28 @@ def _show_renewals(root: Path, text: str, moment: datetime, form: str) -> int:
     is_due = expiring.due or shared.due
     is_unknown = expiring.unreadable or shared.unreadable or (notes and not is_due)
     return NOT_DONE if is_unknown else 1 if is_due else 0
+
+
+def _renewal_lines(due: Sequence[str], unknown: Sequence[str]) -> Iterator[str]:
+    """Yield a line on each enclave; if they are many, enclaves that expire on one day share a line.
+
+    If steps are logged, each enclave has its own line.
+    """
+    lines = [*due, *unknown]
+    if [*first_lines(lines)] == lines:
+        yield from lines
+        return
+    days: dict[str, list[tuple[str, str]]] = {}
+    for line in due:
+        name, _, expiry = line.partition("  ")
+        days.setdefault(expiry.partition("T")[0], []).append((expiry, name))
+    folded = []
+    for found in days.values():
+        names = first_few([name for _, name in found], 2)
+        end = " (the first)" if len({expiry for expiry, _ in found}) > 1 else ""
+        folded.append(f"{names}  {min(found)[0]}{end}")
+    yield from [*folded, *unknown][:MAX_NAMES]
+    yield f"{len(lines)} enclaves in all (-v lists them)"
 
 
 def renewal_markdown(
