@@ -460,8 +460,10 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
     if same_authority and newer:
         raise KeystoreError(
             "it has newer files than the release",
-            f"{newer[0]}; if the keystore comes from a backup, run `sros renew KEYSTORE --all` in "
-            "that keystore, and publish",
+            f"{newer[0]}; if the keystore comes from a backup, first sign the present policy in "
+            "that keystore (`sros generate_artifacts`), because otherwise the rights of the backup "
+            "come back; then run `sros renew KEYSTORE --all`, and publish "
+            "(docs/howto/keystore_is_lost.md)",
         )
 
 

@@ -23,6 +23,7 @@ from sros_tool.fleet.robots import enclaves_of, robot_of
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    FLEET,
     IDENTITY,
     KEY_FILE,
     PERMISSIONS,
@@ -32,7 +33,16 @@ from sros_tool.keystore.layout import (
     key_on_robot,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import RECORDED_LATE, REPORTED, RESTORED, Entry, Ledger
+from sros_tool.keystore.ledger import (
+    BY_POLICY,
+    LATER_RELEASE,
+    PUBLISHING,
+    RECORDED_LATE,
+    REPORTED,
+    RESTORED,
+    Entry,
+    Ledger,
+)
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import (
@@ -48,7 +58,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
 from sros_tool.validity import iso, parse_iso
-from sros_tool.wording import serial_text
+from sros_tool.wording import first_few, serial_text
 
 
 def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certificate) -> str:
@@ -111,12 +121,53 @@ def certificates_of_revoked(
 
 
 def restored_at(keystore: OpenedKeystore) -> str:
-    """Return when sros last noticed a restore, if the keystore trusts an identity CA of that time.
+    """Return when sros noticed the last restore; "" if no identity CA of that time is trusted.
 
-    The time is in ISO 8601 (UTC), and later than the backup.  Returns "" otherwise.
+    The time is in ISO 8601 (UTC), and later than the backup.  What shows the same restore again,
+    before or after it was published, does not change the time.
     """
     entries = _entries_since_trusted_ca(keystore, keystore.ledger_with("what", RESTORED).entries)
-    return next((entry.time for entry in reversed(entries) if entry.what == RESTORED), "")
+    if not any(entry.what == RESTORED for entry in entries):
+        return ""
+    noticed, is_published = "", False
+    for entry in keystore.ledger_file.with_values("what", (RESTORED, "release", "ca")).entries:
+        if entry.what == "release":
+            is_published = bool(noticed)
+        elif entry.what == RESTORED and (
+            not noticed or (is_published and entry.reason in (LATER_RELEASE, PUBLISHING))
+        ):
+            noticed, is_published = entry.time, False
+    return noticed
+
+
+def without_policy_since_restore(keystore: OpenedKeystore, names: Collection[str]) -> list[str]:
+    """Return the enclaves in ``names`` that have the rights of the backup.
+
+    No policy was signed for them since sros noticed that the keystore was restored, so their
+    permissions may lack rights, or have rights, that were changed after the backup.
+    """
+    if not names or not (restored := restored_at(keystore)):
+        return []
+    by_policy: dict[str, bool] = {}
+    for entry in keystore.ledger_file.with_values("enclave", names).entries:
+        if entry.what == "permissions" and entry.policy:
+            is_since = entry.reason == BY_POLICY and entry.time >= restored
+            by_policy[entry.enclave] = by_policy.get(entry.enclave, False) or is_since
+    return [name for name in names if by_policy.get(name) is False]
+
+
+def rights_of_backup_notes(keystore: OpenedKeystore, names: Sequence[str]) -> Iterator[Note]:
+    """Yield a note if enclaves in ``names`` have rights that only a restored backup states."""
+    if old := without_policy_since_restore(keystore, names):
+        root, are = quote(str(keystore.root)), "have" if len(old) > 1 else "has"
+        yield Note(
+            "keystore.rights-of-backup",
+            f"{first_few(old, 3)} {are} the rights of the backup: the keystore was restored (sros "
+            f"noticed it at {restored_at(keystore)}), and no policy was signed since. Publishing "
+            "undoes later changes of rights. First sign the present policy: `sros "
+            f"generate_artifacts -k {root} -p POLICY_FILE"
+            f"{' --fleet FLEET_FILE' * keystore.has(FLEET)}`.",
+        )
 
 
 def subjects_since_restore(keystore: OpenedKeystore, ledger: Ledger) -> frozenset[str] | None:
@@ -745,6 +796,25 @@ def lacking_enclaves_remedy(root: Path) -> str:
         "--revoke-old`. To revoke such an enclave, create it again first, or replace the CA with "
         "`sros rotate_ca`"
     )
+
+
+def perhaps_revoked_step(keystore: OpenedKeystore, names: Sequence[str]) -> str:
+    """Return what to do about enclaves that may have been revoked after the backup."""
+    root, enclaves = quote(str(keystore.root)), " ".join(map(quote, names))
+    steps = (
+        f"Revoke those that should not run any more: `sros revoke {root} {enclaves}`. Robots that "
+        "lose all their enclaves also have to leave the fleet file."
+    )
+    if here := [name for name in names if not key_on_robot(keystore.folder(name))]:
+        renew = f"sros renew {root} {' '.join(map(quote, here))} --new-key --revoke-old"
+        steps += f" Give new keys to the others: `{renew}`."
+    if len(here) < len(names):
+        on_robots = [name for name in names if name not in here]
+        steps += (
+            f" {first_few(on_robots, 3)}, whose keys were made on robots: to keep an enclave, "
+            "make a new key on its robot (docs/howto/rotate.md, A key in wrong hands)."
+        )
+    return steps
 
 
 def new_key_clause(keystore: OpenedKeystore, name: str) -> str:

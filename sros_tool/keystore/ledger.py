@@ -101,6 +101,11 @@ Publishing waits until the keystore has an identity CA that the ledger records a
 """
 RENEWED_BY_NAME = "renewed by name"
 """The ``reason`` of permissions that `sros renew` signed for a named enclave after a restore."""
+BY_POLICY = "by policy"
+"""The ``reason`` of permissions that a policy stated in a keystore that was restored.
+
+If the policy changed nothing, the line repeats that of the present permissions.
+"""
 NEW_CA = "new CA"
 """The ``reason`` of a governance that a rotation signed again, without a change."""
 SAME_KEY = "same key"

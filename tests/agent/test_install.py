@@ -344,6 +344,8 @@ def test_what_a_play_brought_meanwhile_is_not_taken_back(home: Home, robot: Path
     assert install(robot, home.revoked).changed == NAMES
     done = install(robot, home.release({**home.revoked.files, **older_a(home)}))
     assert set(done.kept) == {"/r1/a"} and "newer files than the release" in done.kept["/r1/a"]
+    before, _, after = done.kept["/r1/a"].partition("`sros generate_artifacts`")
+    assert "renew" not in before and "`sros renew KEYSTORE --all`" in after
     assert has(robot, home.revoked)
     (robot / A / "permissions.p7s").write_text("mine")
     done = install(robot, home.release({**home.revoked.files, **older_a(home)}))

@@ -50,10 +50,10 @@ from sros_tool.keystore.delivery.role_keys import RoleKeys
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
-from sros_tool.keystore.known_keys import KnownKeys
+from sros_tool.keystore.known_keys import KnownKeys, restored_at
 from sros_tool.keystore.layout import CRL, FLEET, ca_key_path, fleet_key_path
 from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
-from sros_tool.keystore.ledger import LATER_RELEASE, Entry
+from sros_tool.keystore.ledger import LATER_RELEASE, PUBLISHING, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import LostRecords
@@ -886,6 +886,62 @@ def test_revoking_after_a_restore_covers_certificates_of_after_the_backup(
     assert "restored" not in publisher.run("revoke", "ks", "/r2/base").err
 
 
+@pytest.mark.parametrize("topics", [("x",), ("x", "horn")])
+def test_renewing_the_rights_of_a_backup_is_said_until_a_policy_is_signed(
+    publisher: Home, topics: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A renewal gives them a later date than the rights that were signed after the backup."""
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
+    note, folder = "keystore.rights-of-backup", publisher.folder
+    sign = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    backup = copy_of(publisher.root, folder / "backup")
+    (folder / "policy.xml").write_text(policy_text({"/{robot}/base": allow_publish(*topics)}))
+    publisher.run("renew", "ks", "--all")
+    publisher.run(*sign)
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    publisher.publish(restored=True)
+    noticed = publisher.now
+    publisher.now += timedelta(minutes=1)
+    said = publisher.run("renew", "ks", "--all").err
+    assert f"[{note}]: /r1/base, /r2/base, /r5/base have the rights of the backup: " in said
+    assert f"noticed it at {iso(noticed)}), and no policy was signed since" in said
+    assert "`sros generate_artifacts -k ks -p POLICY_FILE --fleet FLEET_FILE`" in said
+    assert [each.id for each in publisher.publish().notes] == [note]
+    publisher.run("rotate_ca", "ks", "--permissions", "--finish", "--allow-unconfirmed")
+    assert note in publisher.run("renew", "ks", "/r1/base").err, "a new CA states no policy"
+    said = publisher.run(*sign).err
+    assert ("unchanged" in said) is (topics == ("x",))
+    publisher.run("rotate_ca", "ks", "--permissions", "--finish", "--allow-unconfirmed")
+    assert note not in publisher.run("renew", "ks", "--all").err
+    assert note not in {each.id for each in publisher.publish().notes}
+    lines = len(OpenedKeystore(publisher.root).ledger.entries)
+    publisher.run(*sign)
+    assert len(OpenedKeystore(publisher.root).ledger.entries) == lines, "it is said once"
+
+
+def test_what_shows_the_same_restore_again_does_not_change_its_time(publisher: Home) -> None:
+    root = publisher.root
+    for _ in range(2):
+        backup = copy_of(root, publisher.folder / "backup")
+        publisher.run("renew", "ks", "--all")
+        publisher.publish()
+        shutil.rmtree(root)
+        backup.rename(root)
+        publisher.now += timedelta(minutes=1)
+        noticed = publisher.now
+        for shown_by in (LATER_RELEASE, "", PUBLISHING, ""):
+            if shown_by == PUBLISHING:
+                publisher.publish(restored=True)
+            else:
+                lost = LostRecords(OpenedKeystore(root), publisher.now)
+                lost.later_number = 10**9 * bool(shown_by)
+                restore_revocations(root, lost, shown_by=shown_by, now=publisher.now)
+            assert restored_at(OpenedKeystore(root)) == iso(noticed)
+            publisher.now += timedelta(minutes=1)
+
+
 @pytest.mark.parametrize("hours", [23, 25])
 def test_settings_that_a_restored_keystore_has_lost(publisher: Home, hours: int) -> None:
     """The twin differs by less than a day, as if the clock had been wrong."""
@@ -1600,6 +1656,22 @@ def test_a_restored_keystore_never_brings_back_a_ca_that_was_replaced(
     replace_cas(later if has_key else {})
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
     assert (authorities() == later) is has_key
+
+
+def test_a_rotation_names_all_revoked_enclaves_of_a_backup_at_once(publisher: Home) -> None:
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    revoke(publisher.root, ["/r2/base", "/r5/base"], now=publisher.now)
+    for robot in ("r2", "r5"):
+        copy_of(backup / f"enclaves/{robot}", publisher.root / f"enclaves/{robot}")
+    before = snapshot(publisher.root)
+    rotate = ("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    said = sros(*rotate, cwd=publisher.folder).err
+    assert "/r2/base, /r5/base cannot be moved to the new CA" in said
+    assert "`sros revoke ks /r2/base /r5/base`" in said
+    assert "`sros renew ks /r2/base /r5/base --new-key --revoke-old`" in said
+    assert snapshot(publisher.root) == before
+    publisher.run("revoke", "ks", "/r2/base", "/r5/base")
+    publisher.run(*rotate)
 
 
 @pytest.mark.parametrize("roles", [("--identity",), ("--identity", "--permissions")])

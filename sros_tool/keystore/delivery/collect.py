@@ -49,14 +49,18 @@ from sros_tool.keystore.delivery.published import may_have_later_releases, read_
 from sros_tool.keystore.delivery.restored import (
     LaterSeals,
     has_unpublished_restore,
-    perhaps_revoked_step,
     rotation_command,
 )
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.known_keys import KnownKeys, restored_at, revoked_serials
+from sros_tool.keystore.known_keys import (
+    KnownKeys,
+    perhaps_revoked_step,
+    restored_at,
+    revoked_serials,
+)
 from sros_tool.keystore.layout import CERTIFICATE_FILE, IDENTITY, confirmation_file, enclave_folder
 from sros_tool.keystore.ledger import LATER_RELEASE, REPORTED, Entry
 from sros_tool.keystore.lifecycle.change import ChangeOptions, KeystoreChange

@@ -83,7 +83,7 @@ from sros_tool.keystore.fleet import (
     recorded_fleet,
 )
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.known_keys import KnownKeys
+from sros_tool.keystore.known_keys import KnownKeys, rights_of_backup_notes
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -285,6 +285,9 @@ def publish(
         keys.recover(dry_run)
         keys.open(rotate, now, run.expiry)
         changed = run.changed_robots()
+        if not restored:  # which names the changes itself
+            sent = [name for robot in changed for name in robot.enclaves]
+            run.notes += rights_of_backup_notes(keystore, sent)
         if changed or keys.new or keys.has_new_root:
             with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
                 run.keystore = change.keystore

@@ -31,7 +31,12 @@ from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.delivery.release import Release, sealed_robot
 from sros_tool.keystore.delivery.rollback import retired_authorities
 from sros_tool.keystore.fleet import enclaves_of_robot, recorded_fleet
-from sros_tool.keystore.known_keys import KnownKeys, keys_on_robots_remedy, other_keys_remedy
+from sros_tool.keystore.known_keys import (
+    KnownKeys,
+    keys_on_robots_remedy,
+    other_keys_remedy,
+    perhaps_revoked_step,
+)
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     GOVERNANCE_FILE,
@@ -699,25 +704,6 @@ def _few_changes(keystore: OpenedKeystore, lines: Sequence[tuple[str, str]], lab
         _LOG.info("%s: %s", label, text)
     short = [textwrap.shorten(text, _LONGEST, placeholder=" ...") for text in texts[:_NAMED]]
     return "; ".join(short) + ("; -v shows more" if short != texts else "")
-
-
-def perhaps_revoked_step(keystore: OpenedKeystore, names: Sequence[str]) -> str:
-    """Return what to do about enclaves that may have been revoked after the backup."""
-    root, enclaves = quote(str(keystore.root)), " ".join(map(quote, names))
-    steps = (
-        f"Revoke those that should not run any more: `sros revoke {root} {enclaves}`. Robots that "
-        "lose all their enclaves also have to leave the fleet file."
-    )
-    if here := [name for name in names if not key_on_robot(keystore.folder(name))]:
-        renew = f"sros renew {root} {' '.join(map(quote, here))} --new-key --revoke-old"
-        steps += f" Give new keys to the others: `{renew}`."
-    if len(here) < len(names):
-        on_robots = [name for name in names if name not in here]
-        steps += (
-            f" {first_few(on_robots, _NAMED)}, whose keys were made on robots: to keep an enclave, "
-            "make a new key on its robot (docs/howto/rotate.md, A key in wrong hands)."
-        )
-    return steps
 
 
 def _missing_step(root: str, missing: Sequence[str]) -> str:

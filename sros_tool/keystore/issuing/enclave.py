@@ -224,7 +224,8 @@ class EnclaveWriter:
     ``identity`` signs certificates, ``permissions`` signs permissions.  ``entries`` collects
     entries for the ledger.  ``signed`` collects the new rights of enclaves if the keystore has a
     Zenoh network.  ``notes`` report CAs that expire too early for the template's validities.
-    ``keys_on_token`` says that enclaves get keys on a token.
+    ``keys_on_token`` says that enclaves get keys on a token.  ``reason_of_stated`` is what the
+    ledger has as the reason of permissions that a policy states.
     """
 
     def __init__(
@@ -237,8 +238,10 @@ class EnclaveWriter:
         permissions: Authority | None,
         keys_on_token: bool = False,
         secrets: Secrets = no_secrets,
+        reason_of_stated: str = "",
     ) -> None:
         self.entries: list[Entry] = []
+        self._reason_of_stated = reason_of_stated
         self.signed: dict[str, SignedRights] = {}
         self._transaction = transaction
         self._template = template
@@ -295,9 +298,11 @@ class EnclaveWriter:
         validity = self._validity_of_permissions(name, certificate)
         permissions = _permissions(rights, subject, validity)
         message = self._sign(name, permissions)
+        reason = ""
         if isinstance(rights, SignedRights):
             policy, nodes = rights.policy, rights.nodes
         else:
+            reason = self._reason_of_stated
             policy, nodes = rights.enclave.digest, nodes_as_text(nodes_not_shown(rights.enclave))
         self.entries.append(
             document_entry(
@@ -309,7 +314,7 @@ class EnclaveWriter:
                 validity=validity,
                 policy=policy,
                 nodes=nodes,
-            )
+            )._replace(reason=reason)
         )
         if self._template.zenoh:
             (grant,) = permissions.grants

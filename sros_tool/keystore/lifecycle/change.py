@@ -41,6 +41,7 @@ from sros_tool.keystore.known_keys import (
     KnownKeys,
     new_key_clause,
     other_keys_remedy,
+    restored_at,
     unknown_authorities,
     unlisted_revocations,
 )
@@ -53,7 +54,14 @@ from sros_tool.keystore.layout import (
     ROLES,
     check_keystore,
 )
-from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, document_entry
+from sros_tool.keystore.ledger import (
+    BY_POLICY,
+    Entry,
+    Ledger,
+    append,
+    certificate_entry,
+    document_entry,
+)
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights, SupersededCertificate
 from sros_tool.keystore.outcomes import StagedZenoh
 from sros_tool.keystore.reader import OpenedKeystore, check_domain
@@ -396,6 +404,7 @@ class KeystoreChange:
             permissions=self.permissions,
             keys_on_token=keys_on_token,
             secrets=self.keyring.secrets,
+            reason_of_stated=BY_POLICY if not self.is_new and restored_at(self.keystore) else "",
         )
 
     # ── consequences of the new state ──────────────────────────────────────────────────────

@@ -60,7 +60,12 @@ from sros_tool.keystore.issuing.enclave import (
     present_files,
     stated_enclave,
 )
-from sros_tool.keystore.known_keys import restored_at, revoked_serials, subjects_since_restore
+from sros_tool.keystore.known_keys import (
+    restored_at,
+    revoked_serials,
+    subjects_since_restore,
+    without_policy_since_restore,
+)
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
@@ -85,6 +90,7 @@ from sros_tool.keystore.layout import (
     similar_keystores,
 )
 from sros_tool.keystore.ledger import (
+    BY_POLICY,
     ON_ROBOT_ONLY,
     PUBLISHING,
     RESTORED,
@@ -1074,6 +1080,11 @@ class _EnclaveMaker:
             other_files = self._why_other_files_work(name, certificate) if self.revoke_old else ""
             if not other_files:
                 rights = None
+                last = change.recorded_rights.last_entry(name)
+                if last and name in self._without_policy:
+                    time = iso(change.now)
+                    repeated = last._replace(time=time, reason=BY_POLICY, previous="")
+                    self.writer.entries.append(repeated)
         if rights and PERMISSIONS_FILE in present:
             earlier = permissions_to_replace(
                 change.keystore, name, change.permissions.certificate, certificate
@@ -1182,6 +1193,11 @@ class _EnclaveMaker:
             f"{quote(name)} POLICY`."
         )
         yield Note("keystore.rights-lost", text)
+
+    @cached_property
+    def _without_policy(self) -> frozenset[str]:
+        """The enclaves that have the rights of the backup from which the keystore was restored."""
+        return frozenset(without_policy_since_restore(self.change.keystore, [*self.names]))
 
     def _is_kept(self, certificate: x509.Certificate, rights: StatedRights) -> bool:
         """Return whether an enclave's permissions can stay because they already state ``rights``.

@@ -24,6 +24,7 @@ from sros_tool.keystore.fleet import left_enclaves, revoke_command
 from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.issuing.ca_service import CaServiceError
 from sros_tool.keystore.issuing.enclave import EnclaveTokens, EnclaveWriter, Issuance, NewIdentity
+from sros_tool.keystore.known_keys import rights_of_backup_notes
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, key_on_robot
 from sros_tool.keystore.ledger import RENEWED_BY_NAME, RESTORED, Entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
@@ -149,6 +150,7 @@ def renew(
         until = certificates_until(change.keystore, lasting, change.template)
         may_work_longer = bool(lasting) and may_lack_entries(change.keystore)
         change.finish(command="renew with --revoke-old" if revoke_old else "")
+    change.notes += rights_of_backup_notes(change.keystore, renewed)
     return change.result(
         Changed,
         outcomes=dict.fromkeys(renewed, "renewed"),

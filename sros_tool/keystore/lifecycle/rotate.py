@@ -44,7 +44,7 @@ from sros_tool.keystore.issuing.authority import (
 )
 from sros_tool.keystore.issuing.enclave import EnclaveWriter, Issuance, NewIdentity
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring, check_places
-from sros_tool.keystore.known_keys import new_key_clause, unknown_authorities
+from sros_tool.keystore.known_keys import perhaps_revoked_step, unknown_authorities
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -724,6 +724,8 @@ class _Rotator:
         if permissions:
             self._sign_governance(permissions)
         change = self._change
+        if identity:
+            _refuse_revoked_enclaves(change)
         writer = EnclaveWriter(
             change.transaction,
             change.template,
@@ -858,6 +860,32 @@ class _Rotator:
 # ── files of one enclave ───────────────────────────────────────────────────────────────────
 
 
+def _refuse_revoked_enclaves(change: KeystoreChange) -> None:
+    """Raise `KeystoreError` if keys of enclaves were revoked; the error names all of them.
+
+    A restored keystore has such enclaves.  A new CA would make their keys valid again.
+    """
+    revoked: dict[str, KeystoreError] = {}
+    for name in change.names:
+        with suppress(SrosError):  # `_issuance` reports a certificate that cannot be read
+            certificate = change.keystore.certificate_of(name)
+            key: PublicKey = certificate.public_key()  # type: ignore[assignment]
+            try:
+                change.known.refuse_revoked_key(
+                    key, f"enclave {name}", "", certificate, publish_first=False
+                )
+            except KeystoreError as error:
+                revoked[name] = error
+    if revoked:
+        first, *others = revoked.values()
+        raise KeystoreError(
+            f"{', '.join(revoked)} cannot be moved to the new CA: {first.what}"
+            + ", and so were the others" * bool(others),
+            f"{first.why} A new certificate would undo this. Nothing was changed.",
+            perhaps_revoked_step(change.keystore, [*revoked]),
+        )
+
+
 def _issuance(
     change: KeystoreChange,
     name: str,
@@ -867,8 +895,7 @@ def _issuance(
     """Return what the new CAs issue for an enclave; None for an enclave without a certificate.
 
     Raises:
-        KeystoreError: the old CA did not issue the certificate or sign the permissions, or the
-            enclave's key was revoked.
+        KeystoreError: the old CA did not issue the certificate or sign the permissions.
     """
     root = change.root
     folder = enclave_path(root, name)
@@ -884,12 +911,6 @@ def _issuance(
                 "the identity CA of this keystore"
             )
         key: PublicKey = kept.public_key()  # type: ignore[assignment]
-        where = f"{quote(str(root))} {name}"
-        remedy = (
-            f"Revoke the enclave again: `sros revoke {where}`, or --robot for all enclaves of its "
-            f"robot. To keep the enclave instead: {new_key_clause(change.keystore, name)}."
-        )
-        change.known.refuse_revoked_key(key, f"enclave {name}", remedy, kept, publish_first=False)
         certificate = NewIdentity(kept.subject, key)
     rights = None
     if permissions and (folder / PERMISSIONS_FILE).exists():
