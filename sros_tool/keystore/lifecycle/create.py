@@ -1161,12 +1161,13 @@ class _EnclaveMaker:
             return "entries of the ledger may be missing", working, None
         if may_have_later_releases(keystore):
             return "the published folder has later releases than the keystore knows", working, None
-        revoked = revoked_serials(keystore)
+        revoked, digests = revoked_serials(keystore), set[str]()
         for entry in ledger.entries:
             certificates, permissions = working.setdefault(entry.enclave, (set(), []))
             if entry.what == "certificate" and entry.not_after > now:
                 certificates |= {int(entry.serial, 16)} - revoked
-            elif entry.what == "permissions":
+            elif entry.what == "permissions" and entry.sha256 not in digests:
+                digests.add(entry.sha256)  # a policy that changed nothing repeats the line
                 permissions.append(entry.subject)
         return "", working, since
 
