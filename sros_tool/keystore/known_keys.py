@@ -767,8 +767,9 @@ def other_keys_remedy(root: Path, names: Sequence[str]) -> str:
     where, enclaves = quote(str(root)), " ".join(map(quote, names))
     return (
         f"If a robot made its key, sign its request again, with `sros sign_request {where} REQUEST "
-        f"--no-answer --renew`, and run `sros renew {where} {enclaves} --revoke-old`. Otherwise, "
-        f"give new keys: `sros renew {where} {enclaves} --new-key --revoke-old`."
+        f"--no-answer --renew`, and run `sros renew {where} {enclaves} --revoke-old`; if the "
+        "request is refused because the keystore has another key, do what the error says. "
+        f"Otherwise, give new keys: `sros renew {where} {enclaves} --new-key --revoke-old`."
     )
 
 

@@ -47,7 +47,7 @@ from sros_tool.keystore.delivery.repository import (
     read_present,
 )
 from sros_tool.keystore.delivery.role_keys import RoleKeys
-from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.delivery.signing import certify_requests, sign_request
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import KnownKeys, restored_at
@@ -985,7 +985,9 @@ def test_a_key_that_was_replaced_after_the_backup_is_not_certified_again(
     command = f"First run `sros fleet publish {publisher.root} {publisher.pub} --restored`"
     assert command in sros("renew", publisher.root, "/r2/base").err
     rotation = sros("rotate_ca", publisher.root, "--identity", "--finish", "--allow-unconfirmed")
-    assert f"`sros revoke {publisher.root} /r1/base /r2/base`" in rotation.err, "refused where CAs differ"
+    assert f"`sros revoke {publisher.root} /r1/base /r2/base`" in rotation.err, (
+        "refused where CAs differ"
+    )
     if renewed_first:
         publisher.pub.rename(publisher.folder / "server")
         publisher.run("renew", "ks", "--all")
@@ -1674,6 +1676,48 @@ def test_a_rotation_names_all_revoked_enclaves_of_a_backup_at_once(publisher: Ho
     publisher.run(*rotate)
 
 
+@pytest.mark.parametrize("has_new_ca", [True, False])
+def test_a_robot_that_began_to_make_its_keys_after_the_backup_keeps_its_key(
+    publisher: Home, has_new_ca: bool
+) -> None:
+    """The backup has an earlier key of the enclave, and the command for it would make another."""
+    rotate = ("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    policy = ("-p", "policy.xml", "--fleet", "fleet.toml", "--enclave", "/r2/base")
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    request = create_request(publisher.folder / "robot", "/r2/base").file
+    sign = ("sign_request", "ks", request, "--no-answer")
+    if has_new_ca:
+        publisher.run("revoke", "ks", "--robot", "r2")
+        publisher.run(*sign, *policy)
+        publisher.run(*rotate)
+    else:
+        data = request.read_bytes()
+        certify_requests(publisher.root, data, renew=True, replace_keys=True, now=publisher.now)
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    if has_new_ca:
+        publisher.run(*rotate)
+    with pytest.raises(KeystoreError, match=r"keys of /r2/base were replaced") as refused:
+        publisher.publish(restored=True)
+    root = publisher.root
+    remedy = refused.value.remedy
+    assert remedy.startswith("If a robot made its key, sign its request again, with `sros sign_req")
+    assert f"REQUEST --no-answer --renew`, and run `sros renew {root} /r2/base --revoke" in remedy
+    said = sros(*sign, "--renew", cwd=publisher.folder)
+    assert ("has another key in keystore" in said.err) is has_new_ca
+    if has_new_ca:
+        assert "`sros revoke ks /r2/base`" in said.err and "with --enclave /r2/base" in said.err
+        publisher.run("revoke", "ks", "--robot", "r2")
+        publisher.run(*sign, *policy)
+    else:
+        publisher.run("renew", "ks", "/r2/base", "--revoke-old")
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+    certificate = OpenedKeystore(root).certificate_of("/r2/base")
+    wanted = load_request(request.read_bytes(), "it").public_key
+    assert certificate.public_key() == wanted
+
+
 @pytest.mark.parametrize("roles", [("--identity",), ("--identity", "--permissions")])
 @pytest.mark.parametrize("is_replaced", [True, False])
 def test_a_key_that_was_replaced_after_a_rotation_is_not_certified_again(
@@ -1904,7 +1948,7 @@ def test_a_restored_keystore_names_a_stolen_robot_only_to_be_revoked(
     publisher.run(*commands[-2].split()[1:])
     fleet.write_text(with_all.replace("[robots.r2]\n", ""))
     publisher.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
-    publisher.run(*commands[0].split()[1:])
+    publisher.run(*next(each for each in commands if "--new-key" in each).split()[1:])
     assert publisher.publish(restored=True).names("published") == ["r1", "r5"]
 
 

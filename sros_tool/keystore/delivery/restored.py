@@ -655,7 +655,7 @@ def refuse_lost_changes(
         what.append(f"the keys of {shown(keys)} were replaced or revoked, or may have been")
         on_robots = [name for name in keys if key_on_robot(keystore.folder(name))]
         if here := [name for name in keys if name not in on_robots]:
-            steps.append(f"Give new keys: {renew(here, ' --new-key --revoke-old')}.")
+            steps.append(other_keys_remedy(keystore.root, here))
         if on_robots:
             steps.append(keys_on_robots_remedy(keystore.root, on_robots))
     if others := names["other_key"]:
