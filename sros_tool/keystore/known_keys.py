@@ -676,18 +676,37 @@ class KnownKeys:
         *,
         publish_first: bool = True,
     ) -> None:
-        """Raise `KeystoreError` if ``key`` was revoked; ``holder`` names its holder in the error.
+        """Raise the error of `revoked_key_error` if ``key`` was revoked."""
+        error = self.revoked_key_error(
+            key, holder, remedy, certificate, publish_first=publish_first
+        )
+        if error:
+            raise error
+
+    def revoked_key_error(
+        self,
+        key: PublicKey,
+        holder: str,
+        remedy: str,
+        certificate: x509.Certificate | None = None,
+        *,
+        publish_first: bool = True,
+    ) -> KeystoreError | None:
+        """Return an error if ``key`` was revoked; ``holder`` names its holder in the error.
 
         ``certificate`` is the current certificate for the key: a backup may have restored a revoked
         certificate.  With ``publish_first``, if only published lists revoke the key, the remedy is
         to publish with --restored.  Callers set it to False while CAs have to be replaced again,
         because publishing is refused until that is done.
+
+        Raises:
+            SrosError: it is not certain which keys were revoked, because a file cannot be read.
         """
         revoked = self._revoked_keys.get(key_digest(key))
         if certificate and certificate.serial_number in self._revoked_serials:
             revoked = _key_and_description(certificate)[1]
         if revoked:
-            raise KeystoreError(
+            return KeystoreError(
                 f"the key of {holder} was revoked", f"It is the key of {revoked}.", remedy
             )
         if certificate and certificate.serial_number in self._unrecorded_serials:
@@ -702,12 +721,13 @@ class KnownKeys:
                 remedy = (
                     f"First run `{publish} --restored`, which revokes again what this list revokes."
                 )
-            raise KeystoreError(
+            return KeystoreError(
                 f"the certificate of {holder} was revoked",
                 "A revocation list names it, and the ledger does not: the keystore may come from a "
                 "backup.",
                 remedy,
             )
+        return None
 
     def refuse_shared_key(self, key: PublicKey, name: str, remedy: str) -> None:
         """Raise `KeystoreError` if another enclave than ``name`` has ``key``."""

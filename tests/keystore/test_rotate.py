@@ -29,7 +29,7 @@ from sros_tool.keystore.known_keys import (
     unknown_authorities,
     unlisted_revocations,
 )
-from sros_tool.keystore.layout import FLEET_ROOT, ROTATION, enclave_path, list_enclaves
+from sros_tool.keystore.layout import FLEET_ROOT, REVOKED, ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle import rotate
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -879,6 +879,15 @@ def test_an_enclave_of_another_ca_stops_everything(separate: Path, tmp_path: Pat
     shutil.copy(foreign, enclave_path(separate, "/b") / "cert.pem")
     rotate_ca(separate, now=NOW)
     refused(lambda: rotate_ca(separate, now=NOW), separate, "enclave /b cannot be moved")
+
+
+def test_a_revoked_certificate_that_cannot_be_read_stops_a_rotation(separate: Path) -> None:
+    """Any enclave could have its key, which a new CA would make valid again."""
+    unreadable = separate / REVOKED / "ab/cert.pem"
+    unreadable.parent.mkdir(parents=True)
+    unreadable.write_text("")
+    rotate_ca(separate, now=NOW)
+    refused(lambda: rotate_ca(separate, now=NOW), separate, "cannot be read")
 
 
 def test_a_ca_ends_before_the_old_one_only_if_it_was_chosen(tmp_path: Path) -> None:

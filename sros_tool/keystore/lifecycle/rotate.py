@@ -864,18 +864,22 @@ def _refuse_revoked_enclaves(change: KeystoreChange) -> None:
     """Raise `KeystoreError` if keys of enclaves were revoked; the error names all of them.
 
     A restored keystore has such enclaves.  A new CA would make their keys valid again.
+
+    Raises:
+        SrosError: it is not certain which keys were revoked, because a file cannot be read.
     """
     revoked: dict[str, KeystoreError] = {}
     for name in change.names:
-        with suppress(SrosError):  # `_issuance` reports a certificate that cannot be read
+        try:
             certificate = change.keystore.certificate_of(name)
-            key: PublicKey = certificate.public_key()  # type: ignore[assignment]
-            try:
-                change.known.refuse_revoked_key(
-                    key, f"enclave {name}", "", certificate, publish_first=False
-                )
-            except KeystoreError as error:
-                revoked[name] = error
+        except SrosError:  # `_issuance` reports a certificate that cannot be read
+            continue
+        key: PublicKey = certificate.public_key()  # type: ignore[assignment]
+        error = change.known.revoked_key_error(
+            key, f"enclave {name}", "", certificate, publish_first=False
+        )
+        if error:
+            revoked[name] = error
     if revoked:
         first, *others = revoked.values()
         raise KeystoreError(
