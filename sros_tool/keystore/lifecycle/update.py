@@ -560,11 +560,14 @@ class _Updater:
             return None
         validity = validity_of(state.certificate)
         if not certificate and validity.not_after <= change.now:
+            # Without its name, a short-lived enclave is not renewed.
+            short = self._present.settings.longest_validity(name) is not None
+            which = f"{quote(name)} " * short + "--all-expiring soon"
             raise KeystoreError(
                 f"the certificate of enclave {name} has expired",
                 f"It was valid until {iso(validity.not_after)}.",
                 "First renew all that has expired: "
-                f"`sros renew {quote(str(change.root))} --all-expiring soon`.",
+                f"`sros renew {quote(str(change.root))} {which}`.",
             )
         rights: SignedRights | StatedRights
         if replaces_default:
