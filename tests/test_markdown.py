@@ -132,3 +132,6 @@ def test_certificates_as_markdown(tmp_path: Path) -> None:
     (tmp_path / "ks/enclaves/a/cert.pem").write_text("")
     unread = "### Certificates: 0 enclaves need to be renewed (30d), 1 cannot be read\n\n- `/a "
     assert sros(*words, "30d", cwd=tmp_path).out.startswith(unread)
+    (tmp_path / "ks/public/identity_ca.cert.pem").write_text("")
+    unread = "### Certificates: 0 enclaves need to be renewed (30d), 3 cannot be read\n\n- `CAs  "
+    assert sros(*words, "30d", cwd=tmp_path).out.startswith(unread)

@@ -779,9 +779,9 @@ def _show_renewals(root: Path, text: str, moment: datetime, form: str) -> int:
         print_json(expiring_enclaves(expiring, shared))
     else:
         files = [file.line(moment) for file in shared.due]
-        files += [f"{problem.file}  unknown: {problem.problem}" for problem in shared.unreadable]
         due = [describe_lifetime(enclave, moment) for enclave in expiring.due]
         unknown = [f"{enclave.name}  unknown: {enclave.error}" for enclave in expiring.unreadable]
+        unknown_files = [f"{each.file}  unknown: {each.problem}" for each in shared.unreadable]
         none = f"none of {expiring.lasting} enclaves" if expiring.lasting > 1 else "no enclave"
         none_due = f"{none} needs to be renewed ({text})"
         if expiring.short_lived and not expiring.lasting:
@@ -792,9 +792,9 @@ def _show_renewals(root: Path, text: str, moment: datetime, form: str) -> int:
         ]
         if form == "markdown":
             if_none = "; ".join(filter(None, (none_due, *left_out)))
-            echo_lines(renewal_markdown(due, unknown, files, if_none, text))
+            echo_lines(renewal_markdown(due, [*unknown_files, *unknown], files, if_none, text))
         else:
-            for line in (*_renewal_lines(due, unknown), *files):
+            for line in (*_renewal_lines(due, unknown), *files, *unknown_files):
                 echo(line)
             for remark in filter(None, ("" if due or unknown else none_due, *left_out)):
                 echo(remark, err=True)
@@ -836,8 +836,8 @@ def renewal_markdown(
 ) -> str:
     """Return what to renew soon as Markdown, or a sentence that there is nothing.
 
-    ``due`` and ``unknown`` are lines on enclaves to renew and on enclaves that cannot be read, and
-    ``files`` are lines on shared files. ``text_if_none`` is the sentence, and ``threshold`` the
+    ``due`` and ``files`` are lines on enclaves and shared files to renew, and ``unknown`` are lines
+    on what cannot be read. ``text_if_none`` is the sentence, and ``threshold`` the
     time within which a file is due.
     """
     from sros_tool.markdown import bounded_list, code, plain

@@ -60,7 +60,8 @@ def _lists(keystore: OpenedKeystore, now: datetime) -> _Files:
     option = "--refresh --crl FILE" if _has_ca_service(keystore) else "--refresh"
     command = _command(keystore, "crl", option)
     authorities = [file for file, _ in _authorities(keystore, now)]
-    for crl in keystore.revocation_lists[:1]:
+    lists = sorted(keystore.revocation_lists, key=lambda crl: crl.next_update)
+    for crl in lists[:1]:  # in a rotation, DDS needs both lists
         for authority in authorities[:1]:  # no list is valid longer than the identity CA
             command = authority.command if authority.until <= crl.next_update else command
         soon = crl.next_update - crl.expires_soon_from()
