@@ -210,8 +210,8 @@ def _init(
         "tls_ca": str(tls_ca.absolute()) if tls_ca else None,
         "new_key": new_key,
         "restart": restart,
-        "restart_if": None if restart_if is None else tuple(split(restart_if)),
-        "systemctl": None if systemctl is None else tuple(split(systemctl)),
+        "restart_if": None if restart_if is None else _words(restart_if, "--restart-if"),
+        "systemctl": None if systemctl is None else _words(systemctl, "--systemctl"),
         "units": tuple(_parse_unit(text) for text in units) if units else None,
     }
     given = {name: value for name, value in given.items() if value is not None}
@@ -260,6 +260,18 @@ def _init(
         echo(f"kept the earlier {', '.join(kept)}")
     if digest:
         echo(f"root metadata: SHA-256 {digest}")
+
+
+def _words(command: str, option: str) -> tuple[str, ...]:
+    """Return the words of a command, which ``option`` states."""
+    try:
+        return tuple(split(command))
+    except ValueError as error:
+        raise UsageError(
+            f"{option} is not a command",
+            f"{command!r} has a quotation mark or backslash without its counterpart.",
+            "Write it as in a shell.",
+        ) from error
 
 
 def _absolute_source(text: str) -> str:

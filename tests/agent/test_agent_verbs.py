@@ -220,6 +220,7 @@ def test_a_robot_that_was_away_for_a_month_goes_on(world: World) -> None:
         (("--ca", "x"), "neither a certificate file nor"),
         (("--root", "ks/sros.toml"), "not the root metadata"),
         (("--systemctl", ""), "systemctl is empty"),
+        (("--restart-if", "test 'a"), "--restart-if is not a command"),
     ],
 )
 def test_wrong_options_set_up_nothing(words: tuple[str, ...], why: str, world: World) -> None:
