@@ -775,6 +775,12 @@ class Examiner:
                 else "If the program has a new version, which needs more rights: "
                 f"{how_to_learn_one_process(robot)}."
             )
+            node = node_denied_own_service(denial)
+            if node and not (self._root or self._policy) and denial.enclave not in ("", node):
+                other_version = (
+                    f"Perhaps the process runs in the wrong enclave, or {node} has another name or "
+                    "namespace than in the policy: `sros explain KEYSTORE --log LOG` compares them."
+                )
             return (
                 f"{other_version} Otherwise, {show} what is missing in the policy: add it{advice}."
                 f"{_parameter_client_hint(denial, name)}"

@@ -60,9 +60,9 @@ from sros_tool.keystore.participant import (
     load_enclave_of,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.names import is_expression
+from sros_tool.names import is_expression, node_of_service
 from sros_tool.owners import is_for_root_alone
-from sros_tool.policy.model import OFFERING_RIGHT, PEER_RIGHT, Policy
+from sros_tool.policy.model import ALLOW, OFFERING_RIGHT, PEER_RIGHT, Policy
 from sros_tool.policy.rights import Right, is_of_every_node, policy_rights
 from sros_tool.values import shows
 from sros_tool.wording import enumerated, first_few, perhaps_meant
@@ -383,6 +383,16 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
         return
     needed = PEER_RIGHT[question.right]
     rights = asked_enclave.other_rights(question.name)
+    if question.right == "reply" and (node := node_of_service(question.name)):
+        wanted = ("reply", ALLOW, question.name)
+        own = {each.enclave for each in rights if (each.right, each.qualifier, each.name) == wanted}
+        if own:
+            text = (
+                f"this is a service of the node {node}, for which there is "
+                f"{enumerated(sorted(own))}: start the node in that enclave."
+            )
+            yield Note("explain.other-node", text)
+            return
     if any((right.right, right.name) == (needed, question.name) for right in rights):
         return
     if names := likely_names(answer):

@@ -967,6 +967,22 @@ def test_a_unit_that_restarts_gets_each_answer_once(tmp_path: Path) -> None:
     assert [each.count for each in explained(re.sub("Found .*", "", log))] == [1, 1, 1]
 
 
+def test_a_node_in_the_enclave_of_another_node_is_no_reason_to_widen_the_policy(
+    tmp_path: Path,
+) -> None:
+    own = '<services reply="ALLOW"><service>~/get_parameters</service></services>'
+    (tmp_path / "p.xml").write_text(policy_text({"/n": own, "/other": publish("/x")}))
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", cwd=tmp_path).ok()
+    said = sros("explain", "ks", "/other", "serve", "/n/get_parameters", cwd=tmp_path).err
+    assert "a service of the node /n, for which there is /n: start the node in that encla" in said
+    (tmp_path / "log").write_text(
+        "[INFO] [1764500000.1] [rcl]: Found security directory: /ks/enclaves/other\n"
+        "rr/n/get_parametersReply topic not found in allow rule. check_create_datawriter\n"
+    )
+    said = sros("explain", "--log", "log", cwd=tmp_path).out
+    assert "remedy    Perhaps the process runs in the wrong enclave, or /n has another name" in said
+
+
 def test_of_several_enclaves_that_of_the_whole_process_is_named_first(tmp_path: Path) -> None:
     own = '<services reply="ALLOW"><service>~/get_parameters</service></services>'
     profile = '<profile ns="/alone" node="{}">' + own + "</profile>"
