@@ -362,9 +362,9 @@ def watch(
 
     When the union has grown, ``report`` gets the union after ``still`` seconds without a change, at
     the latest after ``patience`` seconds.  So no node is reported before it is discovered
-    completely.  If a node that has just started is not announced yet, the watch
-    lasts up to ``patience`` seconds longer; if the graph still grew, up to ``Settling().still``
-    seconds longer, unless no watch of ``seconds`` seconds could have seen it stand still.
+    completely.  If a node that has just started is not announced yet, the watch lasts up to
+    ``patience`` seconds longer.  If the union grew in the last ``Settling().still`` seconds, and
+    ``seconds`` is more than that, the watch lasts up to ``Settling().still`` seconds longer.
 
     An endpoint that was seen is intermittent if the graph later stood still with the endpoint's
     node, but without the endpoint.  A graph that changes may show a node that is just ending.

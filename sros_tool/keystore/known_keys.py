@@ -124,13 +124,15 @@ def restored_at(keystore: OpenedKeystore) -> str:
     """Return when sros noticed the last restore; "" if no identity CA of that time is trusted.
 
     The time is in ISO 8601 (UTC), and later than the backup.  What shows the same restore again,
-    before or after it was published, does not change the time.
+    before or after it was published, does not change the time.  Restores before the trusted CAs
+    do not count.
     """
     entries = _entries_since_trusted_ca(keystore, keystore.ledger_with("what", RESTORED).entries)
     if not any(entry.what == RESTORED for entry in entries):
         return ""
     noticed, is_published = "", False
-    for entry in keystore.ledger_file.with_values("what", (RESTORED, "release", "ca")).entries:
+    entries = keystore.ledger_file.with_values("what", (RESTORED, "release", "ca")).entries
+    for entry in _entries_since_trusted_ca(keystore, entries):
         if entry.what == "release":
             is_published = bool(noticed)
         elif entry.what == RESTORED and (

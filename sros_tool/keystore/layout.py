@@ -336,7 +336,7 @@ def enclaves_of_closed_robot(root: Path) -> RobotEnclaves:
         )
         here = commands.keys() | {*map(str, listed.get("ended", ()))}
         elsewhere = frozenset(map(str, listed["not_here"]))
-    except (SrosError, ValueError, TypeError, KeyError, AttributeError):
+    except (SrosError, ValueError, TypeError, KeyError, AttributeError, OverflowError):
         return RobotEnclaves()
     own = frozenset({CLOSED_OBSERVER, *here}) - elsewhere
     return RobotEnclaves(own, elsewhere, commands, units, users)

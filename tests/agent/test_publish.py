@@ -940,6 +940,12 @@ def test_what_shows_the_same_restore_again_does_not_change_its_time(publisher: H
                 restore_revocations(root, lost, shown_by=shown_by, now=publisher.now)
             assert restored_at(OpenedKeystore(root)) == iso(noticed)
             publisher.now += timedelta(minutes=1)
+    publisher.run("rotate_ca", "ks", "--finish", "--allow-unconfirmed")
+    assert not restored_at(OpenedKeystore(root))
+    publisher.now += timedelta(minutes=1)
+    lost, again = LostRecords(OpenedKeystore(root), publisher.now), ("/r1/base",)
+    restore_revocations(root, lost, shown_by="", perhaps_revoked=again, now=publisher.now)
+    assert restored_at(OpenedKeystore(root)) == iso(publisher.now), "the restores before the new CA"
 
 
 @pytest.mark.parametrize("hours", [23, 25])

@@ -203,14 +203,23 @@ def test_an_export_may_belong_to_the_user_of_the_nodes(bench: Bench, tmp_path: P
         found = keystore_findings(OpenedKeystore(keystore), Circumstances(bench.now))
         (remedy,) = (each.remedy for each in found if each.id == "keystore.foreign-owner")
         assert (f"If this is user {STRANGER}, change nothing" in remedy) is is_export
-    # Next to the list of processes of `sros close`, it is as ordered; twins: another user, a list
-    # in a folder of a stranger.
+    # Next to the list of processes of `sros close`, it is as ordered; twins: another user, no
+    # user, a folder or a list of a stranger, a folder that everybody can change.
     (tmp_path / "policy.xml").touch()
-    for user, owner, is_found in ((STRANGER, 0, False), (1, 0, True), (STRANGER, STRANGER, True)):
+    listed = tmp_path / "processes.json"
+    for user, owner, author, mode, is_found in (
+        (STRANGER, 0, 0, 0o755, False),
+        (1, 0, 0, 0o755, True),
+        (float("inf"), 0, 0, 0o755, True),
+        (STRANGER, STRANGER, 0, 0o755, True),
+        (STRANGER, 0, STRANGER, 0o755, True),
+        (STRANGER, 0, 0, 0o1777, True),
+    ):
         process = {"enclave": "/base", "user": user}
-        listed = {"processes": [process], "not_here": []}
-        (tmp_path / "processes.json").write_text(json.dumps(listed))
+        listed.write_text(json.dumps({"processes": [process], "not_here": []}))
+        os.chown(listed, author, -1)
         os.chown(tmp_path, owner, -1)
+        tmp_path.chmod(mode)
         found = keystore_findings(OpenedKeystore(tmp_path / "export"), Circumstances(bench.now))
         assert ("keystore.foreign-owner" in {each.id for each in found}) is is_found
     os.chown(tmp_path, 0, -1)

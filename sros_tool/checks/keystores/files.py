@@ -16,6 +16,7 @@ from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import KEY_MADE_ON_ROBOT, ORIGINAL_KEYSTORE
 from sros_tool.keystore.layout import (
     AGENT,
+    CLOSED_PROCESSES,
     CONFIRMED,
     ENCLAVES,
     IDENTITY_CA_FILE,
@@ -37,6 +38,7 @@ from sros_tool.keystore.layout import (
     UnreadPath,
     enclave_folder,
     enclaves_of_closed_robot,
+    folder_of_closed_robot,
     hidden_enclaves,
     is_layout_path,
 )
@@ -260,9 +262,13 @@ _ARCHIVES = re.compile(
 def _users_of_closed_robot(export: Path) -> Collection[int]:
     """Return the users to whom `sros close` orders to give this export; empty for other folders.
 
-    A stranger could have made the folder around the export, unless it is root's or this user's.
+    Also empty if others could have written the list of processes, as in a folder such as ``/tmp``.
     """
-    if export.absolute().parent.stat().st_uid not in (0, os.geteuid()):
+    robot = folder_of_closed_robot(export.absolute())
+    users = frozenset({0, os.geteuid()})
+    if not robot or any(
+        other_writers_clause(path.stat(), users) for path in (robot, robot / CLOSED_PROCESSES)
+    ):
         return ()
     return enclaves_of_closed_robot(export).users
 
