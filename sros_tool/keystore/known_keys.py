@@ -127,11 +127,10 @@ def restored_at(keystore: OpenedKeystore) -> str:
     before or after it was published, does not change the time.  Restores before the trusted CAs
     do not count.
     """
-    entries = _entries_since_trusted_ca(keystore, keystore.ledger_with("what", RESTORED).entries)
-    if not any(entry.what == RESTORED for entry in entries):
+    if not keystore.entries_of(RESTORED):
         return ""
     noticed, is_published = "", False
-    entries = keystore.ledger_file.with_values("what", (RESTORED, "release", "ca")).entries
+    entries = keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
     for entry in _entries_since_trusted_ca(keystore, entries):
         if entry.what == "release":
             is_published = bool(noticed)

@@ -274,8 +274,7 @@ class RevocationListSigner:
 
         The first list was linked into all enclaves, and every enclave created since then gets the
         list.  So once a list was signed, these are the enclaves in the ledger, if it has an index.
-        In a rotation, the
-        result is None, because the files of all enclaves may have to change.
+        In a rotation, the result is None, because the files of all enclaves may have to change.
         """
         if not self.present or read_rotation(self._keystore).stage is not RotationStage.NONE:
             return None
