@@ -101,7 +101,8 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     """Wait until each process runs in its enclave, and return the proofs that the robot is closed.
 
     Waits for at most ``patience`` seconds.  If a process is then missing, the only proofs are that
-    it was not started, and, if so, that the files are not accepted or a requirement is violated.
+    it was not started, and, if so, that a process has a revoked certificate, that the files are not
+    accepted or that a requirement is violated.
     If the enclave of the observer has expired, only the files are examined.
     """
     expired = expired_enclaves(robot, robot.export)
@@ -118,12 +119,13 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     if needed or expected == {*missing}:
         observed = state.observed.with_current_pids(running.processes, robot.export)
         why = _why_missing(running, sorted(needed) or missing, observed)
-        others = (
+        proofs = (
+            *_proof_of_observed_processes([running]),  # first, because a stranger may be at work
+            Proof(STARTED, False, why, details=[_NOT_LOOKED_AT]),
             _proof_of_files(robot, expired, unsigned_text),
             _proof_of_requirements(robot, unsigned_text),
         )
-        started = Proof(STARTED, False, why, details=[_NOT_LOOKED_AT])
-        return [started, *(proof for proof in others if proof.fails)]
+        return [proof for proof in proofs if proof.fails]
     nodes, not_here = ObservedNodes(robot), robot.not_here
     restarts = UnitRestarts(robot, state.observed)
     # A laptop may be away; a computer whose nodes were seen has to be seen again.
