@@ -852,8 +852,8 @@ def _command_lines(status: FleetStatus, facts: str) -> Iterator[str]:
         "robot, and restart its processes",
         "publish": "" if "`sros fleet publish" in facts else f"`{publish}`",
         "restart": "restart the robot's processes, then let it report: `sros agent run FOLDER "
-        f"--once` there, or `ssh {{}} sros fleet report FOLDER --robot {{}} | sros fleet "
-        f"confirm {root} --robot {{}} -`",
+        "--once` there (with `--restarted` if the agent cannot see the processes), or `ssh {} sros "
+        f"fleet report FOLDER --robot {{}} | sros fleet confirm {root} --robot {{}} -`",
     }
     for to_do, command in commands.items():
         robots = [robot.robot for robot in status.robots if robot.to_do == to_do]

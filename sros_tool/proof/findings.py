@@ -756,8 +756,8 @@ def _other_violators_clauses(violation: Violation) -> str:
     for steps in differing:
         text += f"; {steps[0].use.enclave} may {' and '.join(step.action_text() for step in steps)}"
     more = len(violation.witness.others) - len(similar) - len(differing)
-    others = counted(more, "other enclave breaks", "other enclaves break")
-    return f"{text}; {others} the requirement in other ways" if more else text
+    others = counted(more, "more enclave breaks", "more enclaves break")
+    return f"{text}; {others} the requirement, too" if more else text
 
 
 def _listed_names(names: Sequence[str], word: str = "and") -> str:

@@ -251,7 +251,7 @@ def test_of_each_enclave_the_finding_says_what_it_may() -> None:
     ]
     many = {f"/e{number}": may("publish", f"/topic{number}") for number in range(8)}
     (text,) = texts(many, required)
-    others = "2 other enclaves break the requirement in other ways"
+    others = "2 more enclaves break the requirement, too"
     assert f"; /e5 may publish /topic5; {others}, but /* may" in text
     both = {f"/e{number}": may("publish", f"/x{number}", "/y") for number in range(2)}
     required = '[[not_both]]\nfirst.publish = ["/x*"]\nsecond.publish = ["/y"]'

@@ -527,7 +527,9 @@ def _unknown_file_notes(
             left = (
                 "Perhaps a robot was added after the backup of the keystore: put it into the fleet "
                 "file, and sign its requests again before `sros generate_artifacts` "
-                "(docs/howto/keystore_is_lost.md). If it left the fleet, delete its messages."
+                "(docs/howto/keystore_is_lost.md). Then collect again before you deliver, because "
+                "its message shows certificates that the keystore lacks. If it left the fleet, "
+                "delete its messages."
             )
         yield Note(
             "fleet.unknown-in-inbox",
