@@ -773,7 +773,8 @@ class Examiner:
                 "version."
                 if robot is None
                 else "If the program has a new version, which needs more rights: "
-                f"{how_to_learn_one_process(robot)}."
+                f"{how_to_learn_one_process(robot)}. If the right was taken away on purpose, start "
+                "a program that does not use it."
             )
             node = node_denied_own_service(denial)
             if node and not (self._root or self._policy) and denial.enclave not in ("", node):
