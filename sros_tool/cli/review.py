@@ -624,6 +624,13 @@ def _finding_line(finding: Finding) -> str:
     return line + "".join(f" ({place.text}: {place})" for place in places)
 
 
+_OPTIONS = {
+    "new-access": "--new-access allow",
+    "requirements-before": "--dropped-requirements allow",
+}
+"""The options that accept the findings of a step."""
+
+
 def _verdict(result: Review) -> str:
     """Return a sentence with the result."""
     counts = [sum(step.status == status for step in result.steps) for status in (1, 2)]
@@ -636,8 +643,11 @@ def _verdict(result: Review) -> str:
         words.append(f"{counted(allowed, 'step')} found only allowed changes")
     compared = f" compared with {result.base}" if result.base else ""
     failed = {step.kind for step in result.steps if step.status == 1}
-    option = " (--new-access allow accepts new access)" * ("new-access" in failed)
-    return f"{result.head}{compared}: {' and '.join(words) or _nothing_found(result)}{option}"
+    accepting = [f"{_OPTIONS[kind]} accepts {kind}" for kind in _OPTIONS if kind in failed]
+    if accepting and failed - _OPTIONS.keys():
+        accepting.append("no option accepts the others")
+    options = f" ({', '.join(accepting)})" if accepting else ""
+    return f"{result.head}{compared}: {' and '.join(words) or _nothing_found(result)}{options}"
 
 
 def _nothing_found(result: Review) -> str:
