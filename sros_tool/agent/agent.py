@@ -109,8 +109,10 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.keystore.transaction import recover_keystore
+from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    common_name_of,
     key_digest,
     key_digest_of_ca,
     load_certificates,
@@ -465,6 +467,21 @@ class _Round:
         self._state = replace(self._state, removed_keys=tuple(known.values())[:_MOST_COPIED])
         return installation, True
 
+    def _foreign_key_sentence(self, name: str, own: Collection[str]) -> str:
+        """Return what to do if an enclave's folder has the files of another robot's enclave, or "".
+
+        ``own`` are the enclaves of this robot.
+        """
+        with suppress(SrosError, OSError):
+            certificate = read_certificate(self._folder / _certificate_path(name))
+            other = check_enclave_name(common_name_of(certificate.subject))
+            if other not in own:
+                return (
+                    f" The certificate here is of {other}: if its key was here, too, it was in "
+                    f"wrong hands: `sros renew KEYSTORE {other} --new-key --revoke-old`."
+                )
+        return ""
+
     def _changed_files(self) -> dict[str, str] | None:
         """Map each file that is missing, or differs from the installed release, to its SHA-256.
 
@@ -723,7 +740,11 @@ class _Round:
             self._note_error(error)
             return Installation(lists=error.lists if isinstance(error, DiskFullError) else ())
         for name, why in installation.kept.items():
-            remedy = _BRING_KEY.format(settings.robot) if concerns_key(why) else ""
+            remedy = ""
+            if concerns_key(why):
+                remedy = _BRING_KEY.format(settings.robot) + self._foreign_key_sentence(
+                    name, release.enclaves()
+                )
             self._problems.append(f"{name} does not get the files of the release: {why}.{remedy}")
         for name in installation.removed:
             self._problems.append(

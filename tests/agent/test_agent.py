@@ -448,6 +448,16 @@ def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None
     (problem,) = (each for each in r1.round().problems if "/r1/b does not get the files" in each)
     assert bring in problem, "it has another key"
     assert "another computer replaced this one, switch this computer off" in problem
+    assert "wrong hands" not in problem, "it is this robot's own"
+    shutil.rmtree(r1.folder / "enclaves/r1/b")
+    other, copy = home.root.parent / "other", home.root.parent / "r2"
+    shutil.copytree(home.root, other, symlinks=True)
+    sros("create_enclave", other, "/r2/a").ok()
+    sros("distribute_key", other, "/r2/a", copy).ok()
+    (copy / "enclaves/r2/a/crl.pem").unlink()  # it is later than that of the release
+    shutil.copytree(copy / "enclaves/r2/a", r1.folder / "enclaves/r1/b")
+    (problem,) = (each for each in r1.round().problems if "/r1/b does not get the files" in each)
+    assert "is of /r2/a: if its key was here, too, it was in wrong hands: `sros renew" in problem
     assert r1.message().release == 1
     assert has(r1.folder, home.first, ("/r1/a", "/r1/c"))
     assert any(changed in problem for problem in r1.message().problems or ()), "for a day"
