@@ -808,7 +808,8 @@ def _show_renewals(root: Path, text: str, moment: datetime, form: str) -> int:
 def _renewal_lines(due: Sequence[str], unknown: Sequence[str]) -> Iterator[str]:
     """Yield a line on each enclave; if they are many, enclaves that expire on one day share a line.
 
-    If steps are logged, each enclave has its own line.
+    Those of ``unknown`` expiry come first then, so that due ones cannot hide them.  If steps are
+    logged, each enclave has its own line.
     """
     lines = [*due, *unknown]
     if [*first_lines(lines)] == lines:
@@ -823,7 +824,7 @@ def _renewal_lines(due: Sequence[str], unknown: Sequence[str]) -> Iterator[str]:
         names = first_few([name for _, name in found], 2)
         end = " (the first)" if len({expiry for expiry, _ in found}) > 1 else ""
         folded.append(f"{names}  {min(found)[0]}{end}")
-    yield from [*folded, *unknown][:MAX_NAMES]
+    yield from [*unknown, *folded][:MAX_NAMES]
     yield f"{len(lines)} enclaves in all (-v lists them)"
 
 

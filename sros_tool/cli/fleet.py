@@ -847,19 +847,20 @@ def _command_lines(status: FleetStatus, facts: str) -> Iterator[str]:
     root = quote(str(status.keystore))
     publication = status.publication
     publish = f"sros fleet publish {root} {quote((publication and publication.folder) or 'PUB')}"
-    commands = {
-        "deliver": f"`sros distribute_key {root} --robot {{}} FOLDER --force`, bring FOLDER to the "
-        "robot, and restart its processes",
-        "publish": "" if "`sros fleet publish" in facts else f"`{publish}`",
-        "restart": "restart the robot's processes, then let it report: `sros agent run FOLDER "
-        "--once` there (with `--restarted` if the agent cannot see the processes), or `ssh {} sros "
-        f"fleet report FOLDER --robot {{}} | sros fleet confirm {root} --robot {{}} -`",
-    }
-    for to_do, command in commands.items():
+    for to_do in ("deliver", "publish", "restart"):
         robots = [robot.robot for robot in status.robots if robot.to_do == to_do]
+        name = robots[0] if len(robots) == 1 else "NAME"
+        command = {
+            "deliver": f"`sros distribute_key {root} --robot {name} FOLDER --force`, bring FOLDER "
+            "to the robot, and restart its processes",
+            "publish": "" if "`sros fleet publish" in facts else f"`{publish}`",
+            "restart": "restart the robot's processes, then let it report: `sros agent run FOLDER "
+            f"--once` there (with `--restarted` if the agent cannot see the processes), or `ssh "
+            f"{name} sros fleet report FOLDER --robot {name} | sros fleet confirm {root} --robot "
+            f"{name} -`",
+        }[to_do]
         if robots and command:
-            name = robots[0] if len(robots) == 1 else "NAME"
-            yield f"{to_do}: {command.replace('{}', name)}"
+            yield f"{to_do}: {command}"
 
 
 def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:

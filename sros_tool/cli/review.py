@@ -644,8 +644,6 @@ def _verdict(result: Review) -> str:
     compared = f" compared with {result.base}" if result.base else ""
     failed = {step.kind for step in result.steps if step.status == 1}
     accepting = [f"{_OPTIONS[kind]} accepts {kind}" for kind in _OPTIONS if kind in failed]
-    if accepting and failed - _OPTIONS.keys():
-        accepting.append("no option accepts the others")
     options = f" ({', '.join(accepting)})" if accepting else ""
     return f"{result.head}{compared}: {' and '.join(words) or _nothing_found(result)}{options}"
 

@@ -560,6 +560,9 @@ def test_the_check_answers_by_its_exit_status(tmp_path: Path) -> None:
     assert lines[-1] == "22 enclaves in all (-v lists them)" and len(lines) <= 3, "by days"
     assert re.match(r"/a(, /b0 and 20 more)?  permissions until \S+Z( \(the first\))?$", lines[0])
     assert len(sros(*check, "181d", "-v").out.splitlines()) == 22
+    (root / "enclaves/b7/cert.pem").write_text("damaged")
+    unread = sros(*check, "181d")
+    assert (unread.status, unread.out.startswith("/b7  unknown: ")) == (2, True), "none hides it"
     assert sros(*check, "often").status == 2
 
 
