@@ -642,7 +642,7 @@ class FleetStatus:
     recorded: datetime | None = None
     """The time of the last entry of the ledger, in UTC; None for an empty ledger."""
     restored: datetime | None = None
-    """When sros last noticed that the keystore was restored from a backup, in UTC: certificates may
+    """When sros noticed the last restore of the keystore from a backup, in UTC: certificates may
     exist that it lacks, and that no revocation list revokes.  Null if it was never restored, or if
     its identity CA has been replaced since.
     """
