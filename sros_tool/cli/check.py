@@ -808,8 +808,8 @@ def _show_renewals(root: Path, text: str, moment: datetime, form: str) -> int:
 def _renewal_lines(due: Sequence[str], unknown: Sequence[str]) -> Iterator[str]:
     """Yield a line on each enclave; if they are many, enclaves that expire on one day share a line.
 
-    Those of ``unknown`` expiry come first then, so that due ones cannot hide them.  If steps are
-    logged, each enclave has its own line.
+    Those of ``unknown`` expiry come first then, so that due ones cannot hide them, and then those
+    that expire first.  If steps are logged, each enclave has its own line.
     """
     lines = [*due, *unknown]
     if [*first_lines(lines)] == lines:
@@ -820,7 +820,7 @@ def _renewal_lines(due: Sequence[str], unknown: Sequence[str]) -> Iterator[str]:
         name, _, expiry = line.partition("  ")
         days.setdefault(expiry.partition("T")[0], []).append((expiry, name))
     folded = []
-    for found in days.values():
+    for found in sorted(days.values(), key=lambda found: min(found)[0].split()[-1]):
         names = first_few([name for _, name in found], 2)
         end = " (the first)" if len({expiry for expiry, _ in found}) > 1 else ""
         folded.append(f"{names}  {min(found)[0]}{end}")

@@ -16,6 +16,7 @@ import pytest
 from sros_tool import parallel
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.opened import Circumstances
+from sros_tool.cli.check import _renewal_lines
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.expiry import Threshold, parse_threshold, survey
@@ -560,6 +561,8 @@ def test_the_check_answers_by_its_exit_status(tmp_path: Path) -> None:
     assert lines[-1] == "22 enclaves in all (-v lists them)" and len(lines) <= 3, "by days"
     assert re.match(r"/a(, /b0 and 20 more)?  permissions until \S+Z( \(the first\))?$", lines[0])
     assert len(sros(*check, "181d", "-v").out.splitlines()) == 22
+    ends = [f"/{day}  permissions until 2027-05-{day:02}T00:00:00Z" for day in range(31, 6, -1)]
+    assert next(_renewal_lines(ends, ())) == ends[-1], "what expires first comes first"
     (root / "enclaves/b7/cert.pem").write_text("damaged")
     unread = sros(*check, "181d")
     assert (unread.status, unread.out.startswith("/b7  unknown: ")) == (2, True), "none hides it"
